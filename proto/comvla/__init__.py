@@ -1,0 +1,1 @@
+"""The contract between robot and cloud: messages, token codec, model description, errors."""

@@ -1,0 +1,33 @@
+"""Every error of this project derives from :class:`ComVLAError`, so one ``except`` can catch them all."""
+
+
+class ComVLAError(Exception):
+    """Base of all errors raised on purpose by ComVLA. The message names what was expected, what came, and the remedy."""
+
+
+class CodecError(ComVLAError, ValueError):
+    """A payload that is not what the token codec writes."""
+
+
+class CheckpointError(ComVLAError):
+    """A checkpoint that is missing, damaged, foreign or incomplete."""
+
+
+class InstructionError(ComVLAError, ValueError):
+    """An instruction that is empty, too long for the model's prompt, or made of words it never saw."""
+
+
+class ObservationError(ComVLAError, ValueError):
+    """An observation (images, proprioception) of the wrong type, shape, dtype or range."""
+
+
+class LinkError(ComVLAError, ValueError):
+    """A link profile or a reported SNR that makes no sense."""
+
+
+class HandshakeError(ComVLAError):
+    """Robot and server do not speak about the same model or protocol; raised before the robot moves."""
+
+
+class DependencyError(ComVLAError, ImportError):
+    """An optional part (simulator, GL library, torch) is missing; the message says what to install."""

@@ -1,0 +1,134 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Mapping, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Quantization(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    QUANTIZATION_UNSPECIFIED: _ClassVar[Quantization]
+    QUANTIZATION_FLOAT32: _ClassVar[Quantization]
+    QUANTIZATION_FLOAT16: _ClassVar[Quantization]
+    QUANTIZATION_INT8: _ClassVar[Quantization]
+    QUANTIZATION_INT4: _ClassVar[Quantization]
+QUANTIZATION_UNSPECIFIED: Quantization
+QUANTIZATION_FLOAT32: Quantization
+QUANTIZATION_FLOAT16: Quantization
+QUANTIZATION_INT8: Quantization
+QUANTIZATION_INT4: Quantization
+
+class GetModelRequest(_message.Message):
+    __slots__ = ("protocol_version",)
+    PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    protocol_version: int
+    def __init__(self, protocol_version: _Optional[int] = ...) -> None: ...
+
+class GetModelResponse(_message.Message):
+    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size")
+    PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    MODEL_NAME_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
+    NUM_TOKENS_FIELD_NUMBER: _ClassVar[int]
+    TOKEN_DIM_FIELD_NUMBER: _ClassVar[int]
+    TOWER_DIMS_FIELD_NUMBER: _ClassVar[int]
+    GRID_FIELD_NUMBER: _ClassVar[int]
+    ACTION_HORIZON_FIELD_NUMBER: _ClassVar[int]
+    ACTION_DIM_FIELD_NUMBER: _ClassVar[int]
+    PROPRIO_DIM_FIELD_NUMBER: _ClassVar[int]
+    MAX_PROMPT_TOKENS_FIELD_NUMBER: _ClassVar[int]
+    DELTA_ACTIONS_FIELD_NUMBER: _ClassVar[int]
+    CONTROL_PERIOD_S_FIELD_NUMBER: _ClassVar[int]
+    QUANTIZATIONS_FIELD_NUMBER: _ClassVar[int]
+    MAX_REQUEST_BYTES_FIELD_NUMBER: _ClassVar[int]
+    SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    protocol_version: int
+    model_name: str
+    model_fingerprint: str
+    num_tokens: int
+    token_dim: int
+    tower_dims: _containers.RepeatedScalarFieldContainer[int]
+    grid: _containers.RepeatedScalarFieldContainer[int]
+    action_horizon: int
+    action_dim: int
+    proprio_dim: int
+    max_prompt_tokens: int
+    delta_actions: _containers.RepeatedScalarFieldContainer[bool]
+    control_period_s: float
+    quantizations: _containers.RepeatedScalarFieldContainer[Quantization]
+    max_request_bytes: int
+    server_version: str
+    image_size: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class InferRequest(_message.Message):
+    __slots__ = ("session_id", "step", "instruction", "proprio", "payload", "model_fingerprint", "snr_db", "snr_age_s", "protocol_version")
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    INSTRUCTION_FIELD_NUMBER: _ClassVar[int]
+    PROPRIO_FIELD_NUMBER: _ClassVar[int]
+    PAYLOAD_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
+    SNR_DB_FIELD_NUMBER: _ClassVar[int]
+    SNR_AGE_S_FIELD_NUMBER: _ClassVar[int]
+    PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    session_id: str
+    step: int
+    instruction: str
+    proprio: _containers.RepeatedScalarFieldContainer[float]
+    payload: bytes
+    model_fingerprint: str
+    snr_db: float
+    snr_age_s: float
+    protocol_version: int
+    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., instruction: _Optional[str] = ..., proprio: _Optional[_Iterable[float]] = ..., payload: _Optional[bytes] = ..., model_fingerprint: _Optional[str] = ..., snr_db: _Optional[float] = ..., snr_age_s: _Optional[float] = ..., protocol_version: _Optional[int] = ...) -> None: ...
+
+class InferResponse(_message.Message):
+    __slots__ = ("session_id", "step", "actions", "action_horizon", "action_dim", "tokens_used", "batch_size", "cloud_flops", "timings", "load", "model_fingerprint")
+    SESSION_ID_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    ACTIONS_FIELD_NUMBER: _ClassVar[int]
+    ACTION_HORIZON_FIELD_NUMBER: _ClassVar[int]
+    ACTION_DIM_FIELD_NUMBER: _ClassVar[int]
+    TOKENS_USED_FIELD_NUMBER: _ClassVar[int]
+    BATCH_SIZE_FIELD_NUMBER: _ClassVar[int]
+    CLOUD_FLOPS_FIELD_NUMBER: _ClassVar[int]
+    TIMINGS_FIELD_NUMBER: _ClassVar[int]
+    LOAD_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
+    session_id: str
+    step: int
+    actions: _containers.RepeatedScalarFieldContainer[float]
+    action_horizon: int
+    action_dim: int
+    tokens_used: int
+    batch_size: int
+    cloud_flops: float
+    timings: ServerTimings
+    load: LoadHint
+    model_fingerprint: str
+    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., actions: _Optional[_Iterable[float]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., tokens_used: _Optional[int] = ..., batch_size: _Optional[int] = ..., cloud_flops: _Optional[float] = ..., timings: _Optional[_Union[ServerTimings, _Mapping]] = ..., load: _Optional[_Union[LoadHint, _Mapping]] = ..., model_fingerprint: _Optional[str] = ...) -> None: ...
+
+class ServerTimings(_message.Message):
+    __slots__ = ("decode_s", "queue_s", "predict_s", "total_s")
+    DECODE_S_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_S_FIELD_NUMBER: _ClassVar[int]
+    PREDICT_S_FIELD_NUMBER: _ClassVar[int]
+    TOTAL_S_FIELD_NUMBER: _ClassVar[int]
+    decode_s: float
+    queue_s: float
+    predict_s: float
+    total_s: float
+    def __init__(self, decode_s: _Optional[float] = ..., queue_s: _Optional[float] = ..., predict_s: _Optional[float] = ..., total_s: _Optional[float] = ...) -> None: ...
+
+class LoadHint(_message.Message):
+    __slots__ = ("queue_depth", "utilization", "suggested_tokens")
+    QUEUE_DEPTH_FIELD_NUMBER: _ClassVar[int]
+    UTILIZATION_FIELD_NUMBER: _ClassVar[int]
+    SUGGESTED_TOKENS_FIELD_NUMBER: _ClassVar[int]
+    queue_depth: int
+    utilization: float
+    suggested_tokens: int
+    def __init__(self, queue_depth: _Optional[int] = ..., utilization: _Optional[float] = ..., suggested_tokens: _Optional[int] = ...) -> None: ...
