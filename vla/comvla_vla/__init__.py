@@ -1,0 +1,23 @@
+"""The policy, cut in two: an edge half that sees and a cloud half that acts.
+
+Needs torch; the edge SDK imports this package only where a model is loaded.
+"""
+
+from comvla_vla.checkpoints import load_cloud, load_edge, save_policy, split_checkpoint
+from comvla_vla.cloud import CloudModel
+from comvla_vla.config import ModelConfig
+from comvla_vla.edge import EdgeModel
+from comvla_vla.random import random_policy
+from comvla_vla.request import PolicyRequest
+
+__all__ = [
+    "CloudModel",
+    "EdgeModel",
+    "ModelConfig",
+    "PolicyRequest",
+    "load_cloud",
+    "load_edge",
+    "random_policy",
+    "save_policy",
+    "split_checkpoint",
+]

@@ -1,0 +1,144 @@
+"""A Llama-type transformer that looks both ways.
+
+OpenVLA-OFT switches causal masking off, so every token sees every token of its own sequence and no mask is needed
+where there is no padding. There is none here: the rows of a batch are packed end to end, whatever their lengths,
+and only attention looks at where one sequence ends. 99.5 % of the arithmetic is row-wise and pays no padding.
+
+Rotary embeddings use the position that a token had in the *unpruned* sequence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from comvla_vla.config import BackboneConfig
+
+
+class RMSNorm(nn.Module):
+    """Root-mean-square norm, computed in float32, scaled in the model's dtype (as Llama does)."""
+
+    def __init__(self, dim: int, eps: float) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(dim))
+        self.eps = eps
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., dim) to (..., dim)."""
+        wide = x.float()
+        wide = wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + self.eps)
+        return self.weight * wide.to(x.dtype)
+
+
+def rotary_tables(
+    positions: Tensor, config: BackboneConfig, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """Cosine and sine, each (R, head_dim), for integer ``positions`` (R,). Angles are computed in float32."""
+    exponent = (
+        torch.arange(0, config.head_dim, 2, device=positions.device).float() / config.head_dim
+    )
+    angles = positions.float()[:, None] * (config.rope_theta**-exponent)
+    angles = torch.cat([angles, angles], dim=-1)
+    return angles.cos().to(dtype), angles.sin().to(dtype)
+
+
+def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """Rotary embedding in the rotate-half convention; x (R, heads, head_dim)."""
+    first, second = x.chunk(2, dim=-1)
+    return x * cos[:, None] + torch.cat([-second, first], dim=-1) * sin[:, None]
+
+
+class SelfAttention(nn.Module):
+    """Bidirectional attention inside each packed sequence, with fused query, key and value weights."""
+
+    def __init__(self, config: BackboneConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.qkv_proj = nn.Linear(config.hidden, 3 * config.hidden, bias=False)
+        self.o_proj = nn.Linear(config.hidden, config.hidden, bias=False)
+
+    def forward(self, x: Tensor, cos: Tensor, sin: Tensor, lengths: Sequence[int]) -> Tensor:
+        """Rows (R, d) of sequences with ``lengths`` (summing to R) to (R, d)."""
+        heads, width = self.config.heads, self.config.head_dim
+        q, k, v = self.qkv_proj(x).view(-1, 3, heads, width).unbind(1)
+        q, k = rotate(q, cos, sin), rotate(k, cos, sin)
+        if len(set(lengths)) == 1:
+            shape = (len(lengths), lengths[0])
+            q, k, v = (t.unflatten(0, shape).transpose(1, 2) for t in (q, k, v))
+            mixed = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(0, 1)
+        else:
+            parts = zip(
+                q.split(list(lengths)), k.split(list(lengths)), v.split(list(lengths)), strict=True
+            )
+            mixed = torch.cat(
+                [
+                    F.scaled_dot_product_attention(*(t.transpose(0, 1)[None] for t in part))[
+                        0
+                    ].transpose(0, 1)
+                    for part in parts
+                ]
+            )
+        out: Tensor = self.o_proj(mixed.flatten(1))
+        return out
+
+
+class SwiGLU(nn.Module):
+    """Gated feed-forward with fused gate and up weights."""
+
+    def __init__(self, config: BackboneConfig) -> None:
+        super().__init__()
+        self.gate_up_proj = nn.Linear(config.hidden, 2 * config.intermediate, bias=False)
+        self.down_proj = nn.Linear(config.intermediate, config.hidden, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(R, d) to (R, d)."""
+        gate, up = self.gate_up_proj(x).chunk(2, dim=-1)
+        out: Tensor = self.down_proj(F.silu(gate) * up)
+        return out
+
+
+class Layer(nn.Module):
+    """Pre-norm attention and feed-forward, both residual."""
+
+    def __init__(self, config: BackboneConfig) -> None:
+        super().__init__()
+        self.input_layernorm = RMSNorm(config.hidden, config.rms_eps)
+        self.self_attn = SelfAttention(config)
+        self.post_attention_layernorm = RMSNorm(config.hidden, config.rms_eps)
+        self.mlp = SwiGLU(config)
+
+    def forward(self, x: Tensor, cos: Tensor, sin: Tensor, lengths: Sequence[int]) -> Tensor:
+        """Rows (R, d) to (R, d)."""
+        x = x + self.self_attn(self.input_layernorm(x), cos, sin, lengths)
+        out: Tensor = x + self.mlp(self.post_attention_layernorm(x))
+        return out
+
+
+class Backbone(nn.Module):
+    """The transformer between input embeddings and action head; no LM head, which nothing here uses."""
+
+    def __init__(self, config: BackboneConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.layers = nn.ModuleList(Layer(config) for _ in range(config.layers))
+        self.norm = RMSNorm(config.hidden, config.rms_eps)
+
+    def forward(self, rows: Tensor, positions: Tensor, lengths: Sequence[int]) -> Tensor:
+        """Final hidden states after the last norm.
+
+        Args:
+            rows: (R, d) input embeddings, sequences end to end.
+            positions: (R,) rotary positions in the unpruned sequence.
+            lengths: rows of each sequence; they sum to R.
+
+        Returns:
+            (R, d) hidden states.
+        """
+        cos, sin = rotary_tables(positions, self.config, rows.dtype)
+        for layer in self.layers:
+            rows = layer(rows, cos, sin, lengths)
+        out: Tensor = self.norm(rows)
+        return out
