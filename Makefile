@@ -1,0 +1,48 @@
+# `make` lists the targets. Each sets up what it needs by itself (tools/setup.sh).
+#   PYTHON=python3.12   the Python that makes the environment (3.10 to 3.13)
+#   VENV=.venv          where the environment goes
+#   ARGS="-k codec"     handed on to the command behind demo, test, bench and train-mini
+
+SHELL := bash
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint bench proto train-mini
+
+PYTHON ?= python3
+VENV ?= .venv
+ARGS ?=
+export PYTHON VENV
+
+BIN := $(VENV)/bin
+
+help: ## list these targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+demo: ## four episodes over a simulated radio link, and a film of them: runs/demo/demo.html
+	@tools/setup.sh sim
+	$(BIN)/comvla-sim demo $(ARGS)
+
+test: ## all tests, with real servers and the real simulator; coverage at least 90 %
+	@tools/setup.sh dev
+	@tools/setup.sh proto
+	$(BIN)/python -m pytest -n 2 --cov --cov-report=term:skip-covered $(ARGS)
+
+lint: ## style, types, import rules, protocol rules
+	@tools/setup.sh dev
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/buf lint proto
+
+bench: ## transport, edge and batching, each against a limit measured in the same run
+	@tools/setup.sh sim
+	$(BIN)/comvla-sim bench transport $(ARGS)
+	$(BIN)/comvla-sim bench edge $(ARGS)
+	$(BIN)/comvla-sim bench batching $(ARGS)
+
+proto: ## regenerate the code of proto/comvla/v1/policy.proto
+	@tools/proto.sh
+
+train-mini: ## train the shipped policy from scratch (hours); resumes where it stopped
+	@tools/setup.sh sim
+	$(BIN)/comvla-sim train $(ARGS)
