@@ -1,8 +1,11 @@
-"""Every error of this project derives from :class:`ComVLAError`, so one ``except`` can catch them all."""
+"""Every error of this project derives from :class:`ComVLAError`: one ``except`` catches them all."""
 
 
 class ComVLAError(Exception):
-    """Base of all errors raised on purpose by ComVLA. The message names what was expected, what came, and the remedy."""
+    """Base of all errors raised on purpose by ComVLA.
+
+    The message names what was expected, what came, and the remedy.
+    """
 
 
 class CodecError(ComVLAError, ValueError):
@@ -14,7 +17,7 @@ class CheckpointError(ComVLAError):
 
 
 class InstructionError(ComVLAError, ValueError):
-    """An instruction that is empty, too long for the model's prompt, or made of words it never saw."""
+    """An instruction that is empty, too long for the prompt, or made of words never seen."""
 
 
 class ObservationError(ComVLAError, ValueError):
@@ -26,8 +29,8 @@ class LinkError(ComVLAError, ValueError):
 
 
 class HandshakeError(ComVLAError):
-    """Robot and server do not speak about the same model or protocol; raised before the robot moves."""
+    """Robot and server differ in model or protocol; raised before the robot moves."""
 
 
 class DependencyError(ComVLAError, ImportError):
-    """An optional part (simulator, GL library, torch) is missing; the message says what to install."""
+    """An optional part (simulator, GL library, torch) is missing; the message says what to do."""
