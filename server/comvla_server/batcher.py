@@ -1,0 +1,282 @@
+"""Requests of many robots into few forward passes.
+
+The window is zero: while the model runs, whatever arrives waits, and the next forward pass takes
+it, up to ``max_batch``. A quiet server answers at once, a busy one batches by itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+
+from comvla_vla.request import PolicyRequest
+
+from comvla_server.busy import BusyMeter
+from comvla_server.engine import Engine
+from comvla_server.inference_thread import InferenceThread
+from comvla_server.metrics import Metrics
+from comvla_server.passes import Pass, run_pass
+from comvla_server.refusals import Reason, Refusal
+from comvla_server.sessions import Session, SessionTable, superseded
+from comvla_server.tickets import Answer, Ticket
+
+
+class Batcher:
+    """Bounded queue in front of one inference thread. Used from one event loop only.
+
+    One observation per session waits at most; a newer one takes its place in the queue. A ticket
+    whose deadline has passed, or for which nobody waits any more, is dropped before it costs
+    compute.
+
+    Args:
+        engine: runs the batches.
+        max_batch: most requests in one forward pass.
+        max_queue: most sessions that may wait.
+        max_sessions: most sessions whose last answer is remembered.
+        session_ttl_s: silence after which a session is forgotten, seconds.
+        metrics: where batches, compute and failures are counted.
+        thread: the inference thread; a new one where none is given.
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        *,
+        max_batch: int = 8,
+        max_queue: int = 64,
+        max_sessions: int = 1024,
+        session_ttl_s: float = 600.0,
+        metrics: Metrics | None = None,
+        thread: InferenceThread | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._engine = engine
+        self._max_batch = max_batch
+        self._max_queue = max_queue
+        self._sessions = SessionTable(max_sessions, session_ttl_s)
+        self._metrics = metrics or Metrics()
+        self._thread = thread or InferenceThread()
+        self._clock = clock
+        self._busy = BusyMeter()
+        # Sessions with an observation that waits, in order of arrival. A newer observation replaces
+        # the older one in its session, so the session keeps its place in the queue.
+        self._queue: dict[str, Session] = {}
+        self._work = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Starts to take batches from the queue; needs a running event loop."""
+        self._task = asyncio.get_running_loop().create_task(self._dispatch())
+
+    @property
+    def alive(self) -> bool:
+        """False when nothing takes requests from the queue any more."""
+        return self._task is not None and not self._task.done()
+
+    @property
+    def queue_depth(self) -> int:
+        """Requests that wait."""
+        return len(self._queue)
+
+    @property
+    def utilization(self) -> float:
+        """Busy share of the inference thread over the last seconds, 0 to 1."""
+        return self._busy.utilization(self._clock())
+
+    @property
+    def sessions(self) -> Sequence[Session]:
+        """Sessions on record, least recently seen first."""
+        return list(self._sessions)
+
+    def find(self, session_id: str, step: int, digest: bytes) -> Ticket | None:
+        """The ticket of a step that is waiting, running or on record; None for a new step.
+
+        Raises:
+            Refusal: same step with other content (conflict), or an older step (superseded).
+        """
+        session = self._sessions.get(session_id, self._clock())
+        return session.find(step, digest) if session else None
+
+    def admit(self, session_id: str, step: int, request: PolicyRequest, digest: bytes) -> Ticket:
+        """Puts a new step into the queue; an older one of the session that waits is superseded.
+
+        Raises:
+            Refusal: the queue is full.
+        """
+        now_s = self._clock()
+        if session_id not in self._queue and len(self._queue) >= self._max_queue:
+            raise Refusal(
+                Reason.OVERLOAD,
+                f"the queue is full: {len(self._queue)} of {self._max_queue} sessions wait for the "
+                "model; ask less often, send fewer tokens, or add a replica",
+            )
+        session = self._sessions.touch(session_id, now_s)
+        outcome = asyncio.get_running_loop().create_future()
+        ticket = Ticket(session_id, step, digest, request, now_s, outcome)
+        if session.queued is not None:
+            session.queued.resolve(superseded(session_id, session.queued.step, step))
+        session.newest_step = max(session.newest_step, step)
+        session.queued = ticket
+        self._queue[session_id] = session
+        self._work.set()
+        return ticket
+
+    async def wait(self, ticket: Ticket, deadline_s: float) -> Answer:
+        """The answer to a ticket. When its last caller leaves, a waiting ticket leaves the queue.
+
+        Args:
+            ticket: from :meth:`find` or :meth:`admit`.
+            deadline_s: monotonic time at which this caller gives up.
+
+        Raises:
+            Refusal: too late, superseded, or the model failed.
+        """
+        ticket.deadline_s = max(ticket.deadline_s, deadline_s)
+        ticket.callers += 1
+        try:
+            outcome = await asyncio.wait_for(
+                asyncio.shield(ticket.outcome), max(0.0, deadline_s - self._clock())
+            )
+        except asyncio.TimeoutError:
+            raise _too_late(ticket) from None
+        finally:
+            ticket.callers -= 1
+            session = self._queue.get(ticket.session_id)
+            if ticket.callers == 0 and session is not None and session.queued is ticket:
+                self._take(session).resolve(_too_late(ticket))
+        if isinstance(outcome, Refusal):
+            raise outcome
+        return outcome
+
+    async def submit(
+        self,
+        session_id: str,
+        step: int,
+        request: PolicyRequest,
+        deadline_s: float,
+        digest: bytes = b"",
+    ) -> Answer:
+        """Finds or admits a step and waits for its answer.
+
+        Args:
+            session_id: name chosen by the robot.
+            step: counts up within the session.
+            request: what the model needs.
+            deadline_s: monotonic time after which the answer is of no use.
+            digest: fingerprint of the content; a repeat must have the same.
+
+        Raises:
+            Refusal: see :meth:`find`, :meth:`admit` and :meth:`wait`.
+        """
+        ticket = self.find(session_id, step, digest)
+        if ticket is None:
+            ticket = self.admit(session_id, step, request, digest)
+        return await self.wait(ticket, deadline_s)
+
+    async def close(self) -> None:
+        """Stops taking batches; whoever waits is refused. A batch in the model is abandoned."""
+        if self._task is not None:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task
+        for session in self._sessions:
+            for ticket in (session.queued, session.running):
+                if ticket is not None:
+                    ticket.resolve(_cut_off(ticket))
+        self._queue.clear()
+
+    async def _dispatch(self) -> None:
+        while True:
+            await self._work.wait()
+            batch = self._collect()
+            if batch:
+                await self._run(batch)
+            else:
+                self._work.clear()
+
+    def _collect(self) -> list[Session]:
+        """Sessions whose observation runs next, oldest first; what came too late is dropped."""
+        batch: list[Session] = []
+        for session in list(self._queue.values()):
+            if len(batch) == self._max_batch:
+                break
+            ticket = self._take(session)
+            if ticket.deadline_s <= self._clock():
+                ticket.resolve(_too_late(ticket))
+            else:
+                session.running = ticket
+                batch.append(session)
+        return batch
+
+    def _take(self, session: Session) -> Ticket:
+        ticket = session.queued
+        assert ticket is not None, "a session in the queue has an observation that waits"
+        session.queued = None
+        del self._queue[session.session_id]
+        return ticket
+
+    async def _run(self, batch: list[Session]) -> None:
+        requests = [s.running.request for s in batch if s.running and s.running.request]
+        started_s = self._clock()
+        self._busy.begin(started_s)
+        try:
+            passes = await self._thread.run(
+                run_pass, self._engine, requests, self._metrics, self._clock
+            )
+        except Exception as error:  # not even a SystemExit inside a model may end this loop
+            self._metrics.model_errors.inc()
+            passes = [Pass(error, len(batch), 0.0, 0.0)] * len(batch)
+        ended_s = self._clock()
+        self._busy.end(ended_s)
+        self._metrics.inference_busy_seconds.inc(ended_s - started_s)
+        for session, outcome in zip(batch, passes, strict=True):
+            self._finish(session, outcome, started_s)
+
+    def _finish(self, session: Session, outcome: Pass, started_s: float) -> None:
+        ticket, session.running = session.running, None
+        assert ticket is not None
+        assert ticket.request is not None
+        if isinstance(outcome.result, Exception):
+            ticket.resolve(_model_failed(ticket, outcome.result))
+            return
+        answer = Answer(
+            actions=outcome.result,
+            tokens_used=len(ticket.request.positions),
+            batch_size=outcome.batch_size,
+            cloud_flops=outcome.flops,
+            queue_s=started_s - ticket.admitted_s,
+            predict_s=outcome.predict_s,
+        )
+        self._metrics.inference_flops.inc(answer.cloud_flops)
+        self._metrics.step_phase.labels("queue").observe(answer.queue_s)
+        self._metrics.step_phase.labels("predict").observe(answer.predict_s)
+        session.recorded = ticket
+        session.answers += 1
+        ticket.resolve(answer)
+
+
+def _too_late(ticket: Ticket) -> Refusal:
+    return Refusal(
+        Reason.DEADLINE,
+        f"step {ticket.step} was not computed within its deadline: expected an answer before it, "
+        "none came; allow more time, send fewer tokens, or add a replica",
+    )
+
+
+def _model_failed(ticket: Ticket, error: Exception) -> Refusal:
+    return Refusal(
+        Reason.MODEL,
+        f"expected actions, the model raised {type(error).__name__} on step {ticket.step}; "
+        "the server goes on, its log says more",
+    )
+
+
+def _cut_off(ticket: Ticket) -> Refusal:
+    return Refusal(
+        Reason.DRAINING,
+        f"the server stopped before step {ticket.step} was computed: "
+        "send it to another replica, or retry when it is back",
+    )

@@ -1,0 +1,111 @@
+"""The cloud half of a model, as the server sees it: plain calls, no queue, no network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from comvla.model_info import ModelInfo
+from comvla_vla.request import PolicyRequest
+from numpy.typing import NDArray
+
+# Id 1 begins a sequence in every vocabulary that this project builds or loads.
+_BOS_ID = 1
+
+
+class CloudHalf(Protocol):
+    """What :class:`Engine` needs of a model; :class:`comvla_vla.CloudModel` has it."""
+
+    @property
+    def info(self) -> ModelInfo:
+        """Description of the model."""
+
+    def predict(self, requests: list[PolicyRequest]) -> list[NDArray[np.float32]]:
+        """One (H, A) chunk of un-normalised actions for each request."""
+
+    def flops(self, num_tokens: int, instruction: str | Sequence[int]) -> float:
+        """Multiply-adds counted twice for one request of K tokens."""
+
+    def check_instruction(self, instruction: str) -> object:
+        """Raises :class:`comvla.errors.InstructionError` where the model cannot read it."""
+
+
+class ModelOutputError(RuntimeError):
+    """The model returned something that must not reach a robot."""
+
+
+class Engine:
+    """Runs the cloud half and vouches for what comes out of it.
+
+    Attributes:
+        info: description of the model.
+    """
+
+    def __init__(self, cloud: CloudHalf) -> None:
+        self._cloud = cloud
+        self.info = cloud.info
+
+    def predict(self, requests: Sequence[PolicyRequest]) -> list[NDArray[np.float32]]:
+        """Actions for a batch of requests, whose numbers of tokens may differ.
+
+        Args:
+            requests: at least one.
+
+        Returns:
+            One float32 array (H, A) per request, in order.
+
+        Raises:
+            ModelOutputError: wrong number of chunks, a wrong shape, or a value that is not finite.
+        """
+        chunks = self._cloud.predict(list(requests))
+        if len(chunks) != len(requests):
+            raise ModelOutputError(
+                f"the model answered {len(chunks)} chunks to {len(requests)} requests"
+            )
+        expected = (self.info.action_horizon, self.info.action_dim)
+        actions = [np.asarray(chunk, dtype=np.float32) for chunk in chunks]
+        for chunk in actions:
+            if chunk.shape != expected:
+                raise ModelOutputError(
+                    f"the model answered shape {chunk.shape}, expected {expected}"
+                )
+            if not np.isfinite(chunk).all():
+                raise ModelOutputError("the model answered actions that are not finite")
+        return actions
+
+    def flops(self, request: PolicyRequest) -> float:
+        """Multiply-adds counted twice that this request costs in the cloud half."""
+        return float(self._cloud.flops(len(request.positions), request.instruction))
+
+    def check_instruction(self, instruction: str) -> None:
+        """Asks the model's own prompt code.
+
+        Raises:
+            InstructionError: the model cannot read it.
+        """
+        self._cloud.check_instruction(instruction)
+
+    def warm_up(self, max_batch: int) -> None:
+        """Runs the model once alone and once at the largest batch, so that no robot waits for it.
+
+        Observations are unpruned, so this is also the memory peak: a GPU that cannot hold it fails
+        here, before the server says that it is ready.
+        """
+        for size in sorted({1, max_batch}):
+            self.predict([self.blank_request(self.info.num_tokens)] * size)
+
+    def blank_request(self, num_tokens: int, prompt_tokens: int = 16) -> PolicyRequest:
+        """A request of the right shapes without meaning, for warm-up and cost.
+
+        Args:
+            num_tokens: K, 1 to N.
+            prompt_tokens: length of the prompt, cut to what the model reads.
+        """
+        info = self.info
+        return PolicyRequest(
+            tokens=np.zeros((num_tokens, info.token_dim), np.float32),
+            positions=np.arange(num_tokens, dtype=np.int32),
+            instruction=[_BOS_ID] * min(prompt_tokens, info.max_prompt_tokens),
+            proprio=np.zeros(info.proprio_dim, np.float32) if info.proprio_dim else None,
+        )

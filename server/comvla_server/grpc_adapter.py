@@ -1,0 +1,132 @@
+"""The service on a grpc.aio server: options, tolerant parsing, health, reflection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+from comvla import codec
+from comvla.v1 import policy_pb2
+from google.protobuf.message import DecodeError
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from comvla_server.service import STATUS, PolicyService
+from comvla_server.settings import ServerSettings
+
+SERVICE_NAME = policy_pb2.DESCRIPTOR.services_by_name["PolicyService"].full_name
+
+# The service refuses messages above max_request_bytes with words; gRPC itself refuses, before it
+# allocates, those that are larger still.
+_HARD_CAP_FACTOR = 2
+
+
+@dataclass(frozen=True)
+class _Malformed:
+    """Bytes that are no InferRequest."""
+
+    size_bytes: int
+
+
+def make_grpc_server(settings: ServerSettings) -> grpc.aio.Server:
+    """A grpc.aio server with this project's limits and keepalive; needs a running event loop."""
+    return grpc.aio.server(
+        options=server_options(settings), maximum_concurrent_rpcs=settings.max_concurrent_calls
+    )
+
+
+def server_options(settings: ServerSettings) -> list[tuple[str, int]]:
+    """gRPC channel arguments of the server.
+
+    Clients ping every 10 s, with or without calls. gRPC's default is to end a connection that pings
+    more often than every five minutes (GOAWAY, too_many_pings), hence ``min_ping_interval_s``.
+    """
+    min_ping_ms = max(1, round(1000 * settings.min_ping_interval_s))
+    return [
+        *codec.GRPC_OPTIONS,
+        # Two servers on one port would silently share its robots.
+        ("grpc.so_reuseport", 0),
+        ("grpc.max_receive_message_length", _HARD_CAP_FACTOR * settings.max_request_bytes),
+        ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.http2.min_ping_interval_without_data_ms", min_ping_ms),
+        ("grpc.http2.min_recv_ping_interval_without_data_ms", min_ping_ms),
+        # The server's own pings find robots that vanished without a word.
+        ("grpc.keepalive_time_ms", 30_000),
+        ("grpc.keepalive_timeout_ms", 10_000),
+    ]
+
+
+def add_policy_service(server: grpc.aio.Server, service: PolicyService) -> None:
+    """Registers the service so that unparseable bytes are answered INVALID_ARGUMENT.
+
+    gRPC would answer them with an internal error and a stack trace in the log.
+    """
+
+    async def infer(
+        request: policy_pb2.InferRequest | _Malformed,
+        context: grpc.aio.ServicerContext[Any, Any],
+    ) -> policy_pb2.InferResponse:
+        if isinstance(request, _Malformed):
+            refusal = service.note_malformed(request.size_bytes)
+            await context.abort(STATUS[refusal.reason], refusal.message)
+        return await service.Infer(request, context)
+
+    async def get_model(
+        request: policy_pb2.GetModelRequest | _Malformed,
+        context: grpc.aio.ServicerContext[Any, Any],
+    ) -> policy_pb2.GetModelResponse:
+        # Nothing in the request matters for the answer, so a broken one gets it as well.
+        if isinstance(request, _Malformed):
+            request = policy_pb2.GetModelRequest()
+        return await service.GetModel(request, context)
+
+    handlers = {
+        "Infer": grpc.unary_unary_rpc_method_handler(
+            infer,
+            request_deserializer=_parser(policy_pb2.InferRequest),
+            response_serializer=policy_pb2.InferResponse.SerializeToString,
+        ),
+        "GetModel": grpc.unary_unary_rpc_method_handler(
+            get_model,
+            request_deserializer=_parser(policy_pb2.GetModelRequest),
+            response_serializer=policy_pb2.GetModelResponse.SerializeToString,
+        ),
+    }
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE_NAME, handlers),))
+
+
+def _parser(message: Any) -> Any:
+    def parse(data: bytes) -> Any:
+        try:
+            return message.FromString(data)
+        except DecodeError:
+            return _Malformed(len(data))
+
+    return parse
+
+
+class HealthReporter:
+    """``grpc.health.v1`` for the whole server and for the policy service."""
+
+    def __init__(self) -> None:
+        self._servicer = health.aio.HealthServicer()
+
+    async def register(self, server: grpc.aio.Server) -> None:
+        """Adds the health service, NOT_SERVING, and reflection over everything."""
+        await self._set(health_pb2.HealthCheckResponse.NOT_SERVING)
+        health_pb2_grpc.add_HealthServicer_to_server(self._servicer, server)
+        names = (SERVICE_NAME, health.SERVICE_NAME, reflection.SERVICE_NAME)
+        reflection.enable_server_reflection(names, server)
+
+    async def serving(self) -> None:
+        """From now on SERVING."""
+        await self._set(health_pb2.HealthCheckResponse.SERVING)
+
+    async def draining(self) -> None:
+        """NOT_SERVING for good."""
+        await self._servicer.enter_graceful_shutdown()
+
+    async def _set(self, status: Any) -> None:
+        for name in ("", SERVICE_NAME):
+            await self._servicer.set(name, status)

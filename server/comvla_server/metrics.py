@@ -1,0 +1,132 @@
+"""What Prometheus reads: prefix ``comvla_``, base units, no session or robot as a label."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from comvla.model_info import PROTOCOL_VERSION, ModelInfo
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client.process_collector import ProcessCollector
+
+from comvla_server.refusals import Reason
+
+# 1 to 500 ms: control periods are tens of milliseconds, anything above is a miss.
+SECONDS_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5)
+TOKEN_BUCKETS = (1, 4, 8, 16, 32, 48, 64, 96, 128, 256, 512)
+BATCH_BUCKETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
+
+
+class Metrics:
+    """All counters of one server, in a registry of its own, so that two servers can share a process.
+
+    TX is the robot's transmission, seen from the server: counted for every call that arrived,
+    repeats and refused calls included, because they crossed the link too. Three sizes that must not
+    be confused: ``payload`` is the paper's accounting K·D·B/8, ``encoded`` the bytes of the payload
+    field, ``framed`` the whole message with protobuf, gRPC and HTTP/2 framing.
+    """
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        self.tx_payload_bytes = self._counter(
+            "comvla_tx_payload_bytes", "Token bits received, paper accounting K*D*B/8, in bytes."
+        )
+        self.tx_encoded_bytes = self._counter(
+            "comvla_tx_encoded_bytes",
+            "Bytes of the payload fields received (scales and positions).",
+        )
+        self.tx_framed_bytes = self._counter(
+            "comvla_tx_framed_bytes", "Bytes of requests with protobuf, gRPC and HTTP/2 framing."
+        )
+        self.tokens_received = self._counter(
+            "comvla_tokens_received", "Visual tokens that arrived whole."
+        )
+        self.request_tokens = self._histogram(
+            "comvla_request_tokens", "Visual tokens that arrived whole, per request.", TOKEN_BUCKETS
+        )
+        self.inference_flops = self._counter(
+            "comvla_inference_flops",
+            "Multiply-adds counted twice, spent in the cloud half on answers.",
+        )
+        self.inference_busy_seconds = self._counter(
+            "comvla_inference_busy_seconds", "Time that the inference thread spent in the model."
+        )
+        self.model_errors = self._counter(
+            "comvla_model_errors", "Forward passes that failed or returned unusable actions."
+        )
+        self.batch_size = self._histogram(
+            "comvla_batch_size", "Requests per forward pass.", BATCH_BUCKETS
+        )
+        self.step_duration = Histogram(
+            "comvla_step_duration_seconds",
+            "Time from a parsed request to its response, by outcome: ok, repeat, or the refusal.",
+            ["outcome"],
+            buckets=SECONDS_BUCKETS,
+            registry=self.registry,
+        )
+        self.step_phase = Histogram(
+            "comvla_step_phase_seconds",
+            "Time of one phase of an answered step: decode, queue, predict.",
+            ["phase"],
+            buckets=SECONDS_BUCKETS,
+            registry=self.registry,
+        )
+        self.requests_dropped = Counter(
+            "comvla_requests_dropped",
+            "Infer calls that ended without actions, by reason.",
+            ["reason"],
+            registry=self.registry,
+        )
+        # Every series exists from the start: a rate over a late one loses its first step.
+        for reason in Reason:
+            self.requests_dropped.labels(reason.value)
+        for phase in ("decode", "queue", "predict"):
+            self.step_phase.labels(phase)
+        self._queue_depth = Gauge(
+            "comvla_queue_depth", "Requests that wait for the model.", registry=self.registry
+        )
+        self._utilization = Gauge(
+            "comvla_inference_utilization_ratio",
+            "Busy share of the inference thread over the last seconds.",
+            registry=self.registry,
+        )
+        self._sessions = Gauge(
+            "comvla_sessions", "Sessions whose last answer is on record.", registry=self.registry
+        )
+        self._ready = Gauge(
+            "comvla_server_ready", "1 while calls are answered, else 0.", registry=self.registry
+        )
+        self._model_info = Gauge(
+            "comvla_model_info",
+            "Always 1; its labels describe the model.",
+            ["model", "fingerprint", "protocol_version", "server_version"],
+            registry=self.registry,
+        )
+
+    def watch(
+        self,
+        *,
+        queue_depth: Callable[[], float],
+        utilization: Callable[[], float],
+        sessions: Callable[[], float],
+    ) -> None:
+        """Reads these gauges from their owners at every scrape."""
+        self._queue_depth.set_function(queue_depth)
+        self._utilization.set_function(utilization)
+        self._sessions.set_function(sessions)
+
+    def watch_ready(self, ready: Callable[[], bool]) -> None:
+        """Reads readiness at every scrape."""
+        self._ready.set_function(lambda: float(ready()))
+
+    def describe_model(self, info: ModelInfo, server_version: str) -> None:
+        """Publishes which model answers."""
+        self._model_info.labels(
+            info.name, info.fingerprint, str(PROTOCOL_VERSION), server_version
+        ).set(1)
+
+    def _counter(self, name: str, text: str) -> Counter:
+        return Counter(name, text, registry=self.registry)
+
+    def _histogram(self, name: str, text: str, buckets: tuple[float, ...]) -> Histogram:
+        return Histogram(name, text, buckets=buckets, registry=self.registry)

@@ -1,0 +1,40 @@
+"""Why a call was not answered with actions."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from comvla.errors import ComVLAError
+
+from comvla_server.wording import one_line
+
+
+class Reason(str, Enum):
+    """Cause of a refusal; its value is the ``reason`` label of the metrics."""
+
+    MALFORMED = "malformed"  # bytes that are no message of the contract
+    INVALID = "invalid"  # shape, positions, non-finite values, instruction, proprioception
+    CONFLICT = "conflict"  # a step that was already sent with other content
+    MISMATCH = "mismatch"  # another model or another protocol
+    OVERSIZE = "oversize"  # message larger than the cap
+    OVERLOAD = "overload"  # queue full
+    SUPERSEDED = "superseded"  # a newer observation of the session came
+    DEADLINE = "deadline"  # too late to be of use
+    CANCELLED = "cancelled"  # the robot hung up
+    LOADING = "loading"  # the model is not ready yet
+    DRAINING = "draining"  # the server is stopping
+    MODEL = "model"  # the model failed
+
+
+class Refusal(ComVLAError):
+    """A call that ends without actions; carries the reason and a message for the robot.
+
+    Attributes:
+        reason: the cause.
+        message: one line that names what was expected, what came, and the remedy.
+    """
+
+    def __init__(self, reason: Reason, message: str) -> None:
+        self.reason = reason
+        self.message = one_line(message)
+        super().__init__(self.message)

@@ -1,0 +1,185 @@
+"""``comvla-server serve``: load, listen, answer, drain."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import signal
+from typing import Any
+
+from comvla_server import logs
+from comvla_server.engine import Engine
+from comvla_server.server import Server
+from comvla_server.settings import ServerSettings
+
+DEFAULT_PORT = 50051
+DEFAULT_ADMIN_PORT = 8080
+
+_DEFAULTS = ServerSettings()
+
+_DESCRIPTION = """\
+Serve a policy until SIGTERM or Ctrl-C.
+
+One line on stdout says when the server is ready and where:
+  comvla-server ready grpc=127.0.0.1:50051 admin=http://127.0.0.1:8080 model=comvla-mini
+
+The first signal drains: health says NOT_SERVING, new calls are answered UNAVAILABLE, calls in
+flight finish. A second signal exits at once.
+
+Nothing is authenticated or encrypted yet: listen beyond this machine only in a trusted network.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Registers the subcommand."""
+    parser = subparsers.add_parser(
+        "serve",
+        help="serve a policy over gRPC",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    model = parser.add_argument_group("model")
+    model.add_argument(
+        "--model",
+        default="mini",
+        metavar="SOURCE",
+        help="checkpoint folder, hub repository, or mini, the shipped policy (default: mini)",
+    )
+    model.add_argument("--device", default="cpu", help="torch device, e.g. cuda:0 (default: cpu)")
+    model.add_argument(
+        "--dtype",
+        default="float32",
+        choices=("float32", "bfloat16", "float16"),
+        help="number format of the weights (default: float32)",
+    )
+    model.add_argument(
+        "--threads",
+        type=int,
+        metavar="N",
+        help="CPU threads of the model (default: torch decides)",
+    )
+    network = parser.add_argument_group("network")
+    network.add_argument(
+        "--host",
+        default=_DEFAULTS.host,
+        help=f"address to listen on; 0.0.0.0 for all (default: {_DEFAULTS.host})",
+    )
+    network.add_argument(
+        "--port",
+        type=int,
+        default=DEFAULT_PORT,
+        help=f"gRPC port, 0 for a free one (default: {DEFAULT_PORT})",
+    )
+    network.add_argument(
+        "--admin-port",
+        type=int,
+        default=DEFAULT_ADMIN_PORT,
+        metavar="PORT",
+        help="HTTP port of /metrics, /readyz and /docs, 0 for a free one "
+        f"(default: {DEFAULT_ADMIN_PORT})",
+    )
+    limits = parser.add_argument_group("limits")
+    for name, kind, words in (
+        ("max_batch", int, "most requests in one forward pass; 1 turns batching off"),
+        ("max_queue", int, "most robots that may wait; one more is answered RESOURCE_EXHAUSTED"),
+        ("max_sessions", int, "most sessions whose last answer is kept for a retry"),
+        ("max_request_bytes", int, "largest request, bytes"),
+        ("default_deadline_s", float, "deadline of calls that bring none, seconds"),
+        ("grace_s", float, "time that calls in flight get when the server stops, seconds"),
+    ):
+        default = getattr(_DEFAULTS, name)
+        parser_name = "--" + name.replace("_", "-")
+        limits.add_argument(
+            parser_name,
+            type=kind,
+            default=default,
+            metavar="N" if kind is int else "SECONDS",
+            help=f"{words} (default: {default})",
+        )
+    logging = parser.add_argument_group("logs, on stderr")
+    logging.add_argument("--log-format", default="plain", choices=logs.FORMATS)
+    logging.add_argument(
+        "--log-level", default="info", choices=("debug", "info", "warning", "error")
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serves until a signal; 0 when every call in flight was answered, else 1.
+
+    Raises:
+        ComVLAError: settings, ports or checkpoint are no good.
+    """
+    settings = ServerSettings(
+        host=args.host,
+        port=args.port,
+        admin_port=args.admin_port,
+        max_batch=args.max_batch,
+        max_queue=args.max_queue,
+        max_sessions=args.max_sessions,
+        max_request_bytes=args.max_request_bytes,
+        default_deadline_s=args.default_deadline_s,
+        grace_s=args.grace_s,
+    )
+    logs.configure(args.log_format, args.log_level)
+    return asyncio.run(
+        _serve(settings, lambda: load_engine(args.model, args.device, args.dtype, args.threads))
+    )
+
+
+def load_engine(model: str, device: str, dtype: str, threads: int | None) -> Engine:
+    """The cloud half of a checkpoint, ready to run.
+
+    Raises:
+        CheckpointError: missing, damaged, foreign or incomplete.
+    """
+    import torch
+    from comvla_vla import load_cloud
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    return Engine(load_cloud(model, device=device, dtype=getattr(torch, dtype)))
+
+
+async def _serve(settings: ServerSettings, load: Any) -> int:
+    stop = _stop_on_signals()
+    server = Server(load, settings)
+    await server.bind()
+    ready = asyncio.create_task(server.make_ready())
+    stopping = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait({ready, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if ready.done():
+            info = ready.result()
+            print(
+                f"comvla-server ready grpc={server.target} admin={server.admin_url} "
+                f"model={info.name}",
+                flush=True,
+            )
+            await stopping
+    finally:
+        ready.cancel()
+        stopping.cancel()
+        finished = await server.stop()
+        with contextlib.suppress(asyncio.CancelledError):
+            await ready
+    return 0 if finished else 1
+
+
+def _stop_on_signals() -> asyncio.Event:
+    """An event that the first SIGTERM or SIGINT sets; the second ends the process at once."""
+    stop = asyncio.Event()
+
+    def on_signal(number: int) -> None:
+        if stop.is_set():
+            os._exit(128 + number)
+        stop.set()
+
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        # Windows has no signal handlers on its loop: Ctrl-C raises KeyboardInterrupt there.
+        with contextlib.suppress(NotImplementedError):
+            loop.add_signal_handler(number, on_signal, number)
+    return stop

@@ -1,0 +1,238 @@
+"""gRPC for robots and HTTP for operators: one process, one event loop, one inference thread."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import socket
+from collections.abc import Callable, Iterator
+
+import grpc
+import uvicorn
+from comvla import codec
+from comvla.model_info import ModelInfo
+
+from comvla_server.admin import create_app
+from comvla_server.batcher import Batcher
+from comvla_server.engine import Engine
+from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
+from comvla_server.inference_thread import InferenceThread
+from comvla_server.lifecycle import Lifecycle, Phase
+from comvla_server.metrics import Metrics
+from comvla_server.ports import add_grpc_port, authority, listen
+from comvla_server.service import PolicyService, Runtime
+from comvla_server.settings import ServerSettings, SettingsError
+from comvla_server.validation import Validator
+from comvla_server.version import server_version
+
+__all__ = ["Server", "ServerSettings"]
+
+_log = logging.getLogger(__name__)
+
+# Time for responses already written to leave the sockets, and for health watchers to be cut.
+_FLUSH_S = 0.2
+# Envelope of a request around its payload: identifiers, instruction, proprioception.
+_ENVELOPE_BYTES = 16 * 1024
+
+
+class Server:
+    """A policy server. Lives on one event loop, from :meth:`start` to :meth:`stop`, once.
+
+    Args:
+        engine: the model, or a function that loads it; a function runs in the inference thread
+            after the ports are taken, so that probes see a server that loads.
+        settings: see :class:`ServerSettings`.
+
+    Attributes:
+        lifecycle: where the server stands.
+        metrics: its counters.
+        port: gRPC port, known after :meth:`bind`.
+        admin_port: HTTP port, known after :meth:`bind`.
+    """
+
+    def __init__(
+        self, engine: Engine | Callable[[], Engine], settings: ServerSettings | None = None
+    ) -> None:
+        self.settings = settings or ServerSettings()
+        self.lifecycle = Lifecycle()
+        self.metrics = Metrics()
+        self.port = 0
+        self.admin_port = 0
+        self._engine = engine
+        self._health = HealthReporter()
+        self._service: PolicyService | None = None
+        self._grpc: grpc.aio.Server | None = None
+        self._admin: _QuietUvicorn | None = None
+        self._admin_task: asyncio.Task[None] | None = None
+        self._thread: InferenceThread | None = None
+
+    @property
+    def target(self) -> str:
+        """Where robots connect, ``host:port``."""
+        return authority(self.settings.host, self.port)
+
+    @property
+    def admin_url(self) -> str:
+        """Root of the admin surface."""
+        return f"http://{authority(self.settings.host, self.admin_port)}"
+
+    async def start(self) -> None:
+        """Binds, loads, warms up; returns when calls are answered.
+
+        Raises:
+            BindError: a port is taken; nothing was started.
+            ComVLAError: the model cannot be loaded; everything is stopped again.
+        """
+        await self.bind()
+        try:
+            await self.make_ready()
+        except BaseException:
+            await self.stop(grace_s=0)
+            raise
+
+    async def bind(self) -> None:
+        """Takes both ports or none and answers there: not ready yet.
+
+        Raises:
+            BindError: a port is taken.
+        """
+        settings = self.settings
+        server = make_grpc_server(settings)
+        service = PolicyService(self.lifecycle, self.metrics, settings)
+        add_policy_service(server, service)
+        await self._health.register(server)
+        admin_socket = listen(settings.host, settings.admin_port, "--admin-port")
+        try:
+            self.port = add_grpc_port(server, settings.host, settings.port)
+        except BaseException:
+            admin_socket.close()
+            raise
+        self.admin_port = admin_socket.getsockname()[1]
+        self._service, self._grpc = service, server
+        self.metrics.watch_ready(lambda: self.lifecycle.ready)
+        self._start_admin(service, admin_socket)
+        await server.start()
+        self._warn_if_open()
+
+    async def make_ready(self) -> ModelInfo:
+        """Loads and warms up in the inference thread, then says SERVING.
+
+        Returns:
+            Description of the model.
+
+        Raises:
+            SettingsError: max_request_bytes cannot hold an unpruned observation of this model.
+            Exception: whatever loading or the first forward passes raise.
+        """
+        assert self._service is not None, "bind() comes first"
+        self._thread = thread = InferenceThread()
+        load = self._engine
+        engine = load if isinstance(load, Engine) else await thread.run(load)
+        self._check_message_cap(engine)
+        self.lifecycle.enter(Phase.WARMING)
+        await thread.run(engine.warm_up, self.settings.max_batch)
+        if self.lifecycle.phase is not Phase.WARMING:
+            return engine.info  # stopped meanwhile
+        settings = self.settings
+        batcher = Batcher(
+            engine,
+            max_batch=settings.max_batch,
+            max_queue=settings.max_queue,
+            max_sessions=settings.max_sessions,
+            session_ttl_s=settings.session_ttl_s,
+            metrics=self.metrics,
+            thread=thread,
+        )
+        batcher.start()
+        self.metrics.describe_model(engine.info, server_version())
+        self.metrics.watch(
+            queue_depth=lambda: batcher.queue_depth,
+            utilization=lambda: batcher.utilization,
+            sessions=lambda: len(batcher.sessions),
+        )
+        validator = Validator(engine, settings.max_request_bytes)
+        self._service.runtime = Runtime(engine, batcher, validator)
+        self.lifecycle.enter(Phase.SERVING)
+        await self._health.serving()
+        _log.info("serving %s", engine.info.name, extra={"grpc": self.target})
+        return engine.info
+
+    async def stop(self, grace_s: float | None = None) -> bool:
+        """Drains and stops: refuses new calls, lets those in flight finish, then closes the ports.
+
+        Args:
+            grace_s: seconds that calls in flight may take, the setting where None.
+
+        Returns:
+            True when every call in flight was answered.
+        """
+        self.lifecycle.enter(Phase.DRAINING)
+        await self._health.draining()
+        finished = await self._drain(self.settings.grace_s if grace_s is None else grace_s)
+        if self._grpc is not None:
+            await self._grpc.stop(_FLUSH_S)
+        if self._admin is not None and self._admin_task is not None:
+            self._admin.should_exit = True
+            await self._admin_task
+        if self._thread is not None:
+            self._thread.close(timeout_s=1.0 if finished else 0.0)
+        self.lifecycle.enter(Phase.STOPPED)
+        return finished
+
+    async def _drain(self, grace_s: float) -> bool:
+        if self._service is None:
+            return True
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._service.idle.wait(), grace_s)
+        finished = self._service.idle.is_set()
+        if not finished:
+            _log.warning("calls in flight were cut off after %.1f s of grace", grace_s)
+        if self._service.runtime is not None:
+            await self._service.runtime.batcher.close()
+        return finished
+
+    def _start_admin(self, service: PolicyService, admin_socket: socket.socket) -> None:
+        app = create_app(self.lifecycle, self.metrics, service, self.settings)
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            ws="none",
+            timeout_graceful_shutdown=1,
+        )
+        self._admin = _QuietUvicorn(config)
+        self._admin_task = asyncio.create_task(self._admin.serve(sockets=[admin_socket]))
+
+    def _check_message_cap(self, engine: Engine) -> None:
+        info = engine.info
+        payload_bytes = codec.encoded_bytes(
+            info.num_tokens, info.token_dim, "float32", num_towers=len(info.tower_dims)
+        )
+        needed = payload_bytes + _ENVELOPE_BYTES
+        if needed > self.settings.max_request_bytes:
+            raise SettingsError(
+                f"max_request_bytes is {self.settings.max_request_bytes}, an unpruned float32 "
+                f"observation of {info.name} needs {needed}: raise --max-request-bytes"
+            )
+
+    def _warn_if_open(self) -> None:
+        with contextlib.suppress(ValueError):
+            if ipaddress.ip_address(self.settings.host).is_loopback:
+                return
+        if self.settings.host != "localhost":
+            _log.warning(
+                "listening beyond this machine on %s without authentication: "
+                "keep it in a trusted network",
+                self.settings.host,
+            )
+
+
+class _QuietUvicorn(uvicorn.Server):
+    """uvicorn without its signal handlers: one place decides when this process stops."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield

@@ -1,0 +1,66 @@
+"""One (session, step) on its way through the server, and what comes out of it."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+
+import numpy as np
+from comvla_vla.request import PolicyRequest
+from numpy.typing import NDArray
+
+from comvla_server.refusals import Refusal
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Actions and what they cost.
+
+    Attributes:
+        actions: (H, A) float32.
+        tokens_used: K.
+        batch_size: requests that shared the forward pass.
+        cloud_flops: multiply-adds counted twice, this request's share.
+        queue_s: seconds between admission and the start of the forward pass.
+        predict_s: seconds of the forward pass.
+    """
+
+    actions: NDArray[np.float32]
+    tokens_used: int
+    batch_size: int
+    cloud_flops: float
+    queue_s: float
+    predict_s: float
+
+
+Outcome = Answer | Refusal
+
+
+@dataclass(eq=False)
+class Ticket:
+    """A place in the queue; repeats of the same step share it.
+
+    Attributes:
+        session_id, step: identity of the request.
+        digest: fingerprint of the request's content.
+        request: what the model needs, or None once the outcome is there.
+        admitted_s: monotonic time of admission.
+        deadline_s: monotonic time after which nobody waits any more (the latest of all callers).
+        callers: calls that wait for the outcome right now.
+        outcome: an answer or a refusal; never an exception, so that none goes unretrieved.
+    """
+
+    session_id: str
+    step: int
+    digest: bytes
+    request: PolicyRequest | None
+    admitted_s: float
+    outcome: asyncio.Future[Outcome]
+    deadline_s: float = 0.0
+    callers: int = field(default=0)
+
+    def resolve(self, outcome: Outcome) -> None:
+        """Settles the ticket once and lets go of the tokens."""
+        self.request = None
+        if not self.outcome.done():
+            self.outcome.set_result(outcome)

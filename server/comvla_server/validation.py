@@ -1,0 +1,177 @@
+"""What must hold before a request may cost compute."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from comvla import codec
+from comvla.errors import CodecError, InstructionError
+from comvla.model_info import PROTOCOL_VERSION
+from comvla.v1 import policy_pb2
+from comvla_vla.request import PolicyRequest
+from numpy.typing import NDArray
+
+from comvla_server.engine import Engine
+from comvla_server.refusals import Reason, Refusal
+from comvla_server.wording import shown
+
+MAX_SESSION_ID_CHARS = 128
+MAX_INSTRUCTION_CHARS = 2000
+# What float16, the narrowest floating-point coding of the contract, can hold. Larger values are
+# finite but overflow inside a model.
+MAX_ABS_VALUE = 65504.0
+
+_SESSION_ID = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._:@/+=-]{{0,{MAX_SESSION_ID_CHARS - 1}}}")
+
+
+@dataclass(frozen=True)
+class Validator:
+    """Checks requests against the model; refusals name what was expected, what came, the remedy.
+
+    Attributes:
+        engine: the model that will run.
+        max_request_bytes: largest message, bytes.
+    """
+
+    engine: Engine
+    max_request_bytes: int
+
+    def check_identity(self, request: policy_pb2.InferRequest) -> None:
+        """Size, protocol, model and session: what can be told without looking at the content.
+
+        Raises:
+            Refusal: oversize, mismatch or invalid.
+        """
+        size = request.ByteSize()
+        if size > self.max_request_bytes:
+            raise Refusal(
+                Reason.OVERSIZE,
+                f"expected a request of at most {self.max_request_bytes} bytes, got {size}: "
+                "send fewer tokens or a narrower quantization, or raise --max-request-bytes",
+            )
+        if request.protocol_version != PROTOCOL_VERSION:
+            raise Refusal(
+                Reason.MISMATCH,
+                f"server speaks protocol version {PROTOCOL_VERSION}, the request says "
+                f"{request.protocol_version}: install the same comvla release on robot and server",
+            )
+        info = self.engine.info
+        if request.model_fingerprint != info.fingerprint:
+            raise Refusal(
+                Reason.MISMATCH,
+                f"server runs {info.name} with fingerprint {shown(info.fingerprint)}, the request "
+                f"says {shown(request.model_fingerprint)}: "
+                "load the edge half of the same checkpoint",
+            )
+        if not _SESSION_ID.fullmatch(request.session_id):
+            raise Refusal(
+                Reason.INVALID,
+                f"expected a session_id of 1 to {MAX_SESSION_ID_CHARS} letters, digits or ._:@/+=- "
+                f"that begins with a letter or digit, got {shown(request.session_id)}: "
+                "a UUID is a good choice",
+            )
+
+    def read(self, request: policy_pb2.InferRequest) -> PolicyRequest:
+        """Checks the content and decodes the tokens.
+
+        Returns:
+            What the model needs: tokens (K, D) float32, 1 <= K <= N; positions (K,) int32.
+
+        Raises:
+            Refusal: invalid.
+        """
+        self._check_link_report(request)
+        self._check_instruction(request.instruction)
+        proprio = self._proprio(request)
+        tokens, positions = self._tokens(request.payload)
+        return PolicyRequest(tokens, positions, request.instruction, proprio)
+
+    def _check_link_report(self, request: policy_pb2.InferRequest) -> None:
+        if request.HasField("snr_db") and not math.isfinite(request.snr_db):
+            raise _invalid(
+                f"expected a finite snr_db, got {request.snr_db}: leave the field unset where no "
+                "report exists"
+            )
+        age_s = request.snr_age_s
+        if request.HasField("snr_age_s") and not (math.isfinite(age_s) and age_s >= 0):
+            raise _invalid(
+                f"expected a finite snr_age_s of at least 0 seconds, got {age_s}: take it from a "
+                "monotonic clock"
+            )
+
+    def _check_instruction(self, instruction: str) -> None:
+        if len(instruction) > MAX_INSTRUCTION_CHARS:
+            raise _invalid(
+                f"expected an instruction of at most {MAX_INSTRUCTION_CHARS} characters, got "
+                f"{len(instruction)}: say it in fewer words"
+            )
+        try:
+            self.engine.check_instruction(instruction)
+        except InstructionError as error:
+            raise _invalid(f"instruction {shown(instruction)}: {error}") from error
+
+    def _proprio(self, request: policy_pb2.InferRequest) -> NDArray[np.float32] | None:
+        expected = self.engine.info.proprio_dim
+        came = len(request.proprio)
+        if came != expected:
+            raise _invalid(
+                f"expected {expected} proprioception values, got {came}: send the raw vector that "
+                f"{self.engine.info.name} was trained with"
+                if expected
+                else f"expected no proprioception, got {came} values: "
+                f"{self.engine.info.name} takes none"
+            )
+        if not expected:
+            return None
+        proprio = np.asarray(request.proprio, dtype=np.float32)
+        _check_values(proprio, "proprioception")
+        return proprio
+
+    def _tokens(self, payload: bytes) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        info = self.engine.info
+        try:
+            tokens, positions = codec.decode(
+                payload,
+                max_tokens=info.num_tokens,
+                token_dim=info.token_dim,
+                num_tokens=info.num_tokens,
+            )
+        except CodecError as error:
+            raise _invalid(f"payload: {error}") from error
+        if len(positions) == 0:
+            raise _invalid(
+                f"expected 1 to {info.num_tokens} tokens, got none: "
+                "where the link carries no token, act on the rest of the last chunk"
+            )
+        _check_values(tokens, "tokens")
+        return tokens, positions
+
+
+def content_digest(request: policy_pb2.InferRequest) -> bytes:
+    """16 bytes over what decides the answer; a retry has the same, whatever its SNR report."""
+    digest = hashlib.blake2b(digest_size=16)
+    text = request.instruction.encode()
+    digest.update(struct.pack("<QQ", len(text), len(request.proprio)))
+    digest.update(text)
+    digest.update(np.asarray(request.proprio, dtype="<f4").tobytes())
+    digest.update(request.payload)
+    return digest.digest()
+
+
+def _check_values(values: NDArray[np.float32], what: str) -> None:
+    # One pass over the array: a NaN makes the comparison False as well.
+    largest = float(np.abs(values).max())
+    if not largest <= MAX_ABS_VALUE:
+        raise _invalid(
+            f"expected finite {what} of at most {MAX_ABS_VALUE:g} in size, got {largest:g}: "
+            "check the sensor or the edge half for overflow"
+        )
+
+
+def _invalid(message: str) -> Refusal:
+    return Refusal(Reason.INVALID, message)
