@@ -10,6 +10,7 @@ Rotary embeddings use the position that a token had in the *unpruned* sequence.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 
 import torch
 import torch.nn.functional as F
@@ -52,7 +53,10 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
 
 
 class SelfAttention(nn.Module):
-    """Bidirectional attention inside each packed sequence, with fused query, key and value weights."""
+    """Bidirectional attention inside each packed sequence; query, key and value weights are one.
+
+    Neighbouring sequences of one length share a kernel call, so callers sort by length.
+    """
 
     def __init__(self, config: BackboneConfig) -> None:
         super().__init__()
@@ -65,23 +69,16 @@ class SelfAttention(nn.Module):
         heads, width = self.config.heads, self.config.head_dim
         q, k, v = self.qkv_proj(x).view(-1, 3, heads, width).unbind(1)
         q, k = rotate(q, cos, sin), rotate(k, cos, sin)
-        if len(set(lengths)) == 1:
-            shape = (len(lengths), lengths[0])
-            q, k, v = (t.unflatten(0, shape).transpose(1, 2) for t in (q, k, v))
-            mixed = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(0, 1)
-        else:
-            parts = zip(
-                q.split(list(lengths)), k.split(list(lengths)), v.split(list(lengths)), strict=True
+        mixed, start = [], 0
+        for length, run in groupby(lengths):
+            count = len(list(run))
+            rows = slice(start, start + count * length)
+            start = rows.stop
+            q_, k_, v_ = (
+                t[rows].view(count, length, heads, width).transpose(1, 2) for t in (q, k, v)
             )
-            mixed = torch.cat(
-                [
-                    F.scaled_dot_product_attention(*(t.transpose(0, 1)[None] for t in part))[
-                        0
-                    ].transpose(0, 1)
-                    for part in parts
-                ]
-            )
-        out: Tensor = self.o_proj(mixed.flatten(1))
+            mixed.append(F.scaled_dot_product_attention(q_, k_, v_).transpose(1, 2).flatten(0, 1))
+        out: Tensor = self.o_proj(torch.cat(mixed).flatten(1))
         return out
 
 

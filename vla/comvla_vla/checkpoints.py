@@ -290,6 +290,8 @@ def _write(
     (partial / STATISTICS).write_text(json.dumps(statistics, indent=1) + "\n")
     (partial / TOKENIZER).write_text(tokenizer)
     save_file(dict(tensors), partial / WEIGHTS, metadata={"format": "pt", "fingerprint": digest})
+    # safetensors writes for the owner only; a policy is read by services under other accounts.
+    (partial / WEIGHTS).chmod(0o644)
     if folder.exists():
         shutil.rmtree(folder)
     partial.rename(folder)

@@ -38,7 +38,7 @@ class ActionHead(nn.Module):
 
     def forward(self, slots: Tensor) -> Tensor:
         """(B, H * A, d) hidden states to (B, H, A) normalised actions; no tanh, no clipping."""
-        x = slots.unflatten(1, (self.config.horizon, self.config.action_dim)).flatten(2)
+        x = slots.reshape(len(slots), self.config.horizon, -1)
         x = F.relu(self.fc1(self.layer_norm1(x)))
         for block in self.mlp_resnet_blocks:
             x = block(x)

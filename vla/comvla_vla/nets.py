@@ -36,10 +36,11 @@ class EdgeNet(nn.Module):
     def queries(self, ids: Tensor) -> Tensor:
         """Language queries (..., Q, d) for prompt ids (..., T) without begin-of-sequence; Q = T * queries_per_token."""
         if self.config.prompt.queries_per_token == 1:
-            return self.embed_tokens(ids)  # type: ignore[no-any-return]
-        return (
-            self.query_embed(ids).unflatten(-1, (-1, self.config.backbone.hidden)).flatten(-3, -2)
-        )
+            words: Tensor = self.embed_tokens(ids)
+            return words
+        table: Tensor = self.query_embed(ids)
+        hidden = self.config.backbone.hidden
+        return table.view(*ids.shape[:-1], -1, hidden)
 
 
 class CloudNet(nn.Module):
@@ -80,25 +81,27 @@ class CloudNet(nn.Module):
         """
         text = [self.embed_tokens(ids) for ids in prompts]
         tail = self._tail(text[0])
-        state = (
-            [None] * len(text)
-            if proprio is None
-            else self.proprio_projector(proprio).unsqueeze(1).unbind(0)
-        )
-        rows, where, lengths, first = [], [], [], []
+        state: Sequence[Tensor]
+        if proprio is None:
+            state = [tail[:0]] * len(text)
+        else:
+            state = self.proprio_projector(proprio).unsqueeze(1).unbind(0)
+        rows, where = [], []
         for visual, at, words, body in zip(projected, positions, text, state, strict=True):
-            parts = [words[:1], visual, *([] if body is None else [body]), words[1:], tail]
-            rest = sum(len(p) for p in parts[2:])
+            rows.append(torch.cat([words[:1], visual, body, words[1:], tail]))
+            # Tokens after the visual ones keep the place they had behind all N of them.
             after = 1 + self.config.num_tokens
-            rows += parts
-            where += [at.new_zeros(1), at + 1, torch.arange(after, after + rest, device=at.device)]
-            length = 1 + len(visual) + rest
-            first.append(sum(lengths) + length - len(tail) + self.config.action.first_slot)
-            lengths.append(length)
-        hidden = self.backbone(torch.cat(rows), torch.cat(where), lengths)
-        slots = torch.stack([hidden[i : i + self.config.action.slots] for i in first])
-        starts = torch.tensor([0, *lengths[:-1]], device=hidden.device).cumsum(0)
-        return self.action_head(slots), hidden[starts]
+            rest = torch.arange(after, after + len(rows[-1]) - 1 - len(at), device=at.device)
+            where.append(torch.cat([at.new_zeros(1), at + 1, rest]))
+        order = sorted(range(len(rows)), key=lambda i: len(rows[i]))
+        lengths = [len(rows[i]) for i in order]
+        hidden = self.backbone(
+            torch.cat([rows[i] for i in order]), torch.cat([where[i] for i in order]), lengths
+        ).split(lengths)
+        hidden = [hidden[place] for place in sorted(range(len(order)), key=order.__getitem__)]
+        stop = len(tail) - self.config.action.first_slot
+        slots = torch.stack([h[len(h) - stop :][: self.config.action.slots] for h in hidden])
+        return self.action_head(slots), torch.stack([h[0] for h in hidden])
 
     def _tail(self, like: Tensor) -> Tensor:
         """Action placeholders and stop token (H * A + 1, d)."""

@@ -1,4 +1,4 @@
-"""Data-set statistics: raw proprioception in, real actions out (OpenVLA's bounds-q99 normalisation)."""
+"""Data-set statistics: raw proprioception in, real actions out."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from numpy.typing import NDArray
 # OpenVLA divides by (q99 - q01 + 1e-8) and multiplies by the same on the way back.
 _EPSILON = 1e-8
 
+# OpenVLA-OFT's two ways to choose bounds: percentiles (LIBERO) or extremes (ALOHA, and the small policy here).
+_BOUNDS = {"bounds_q99": ("q01", "q99"), "bounds": ("min", "max")}
+
 
 @dataclass(frozen=True)
 class Statistics:
-    """First and 99th percentile of actions and proprioception in the training data.
+    """Bounds of actions and proprioception in the training data.
 
     Attributes:
         key: name of the data set.
-        action_low, action_high: (A,) q01 and q99. action_mask: (A,) True where actions are normalised.
-        proprio_low, proprio_high: (P,) q01 and q99; empty where the model takes no proprioception.
+        action_low, action_high: (A,) bounds. action_mask: (A,) True where actions are normalised.
+        proprio_low, proprio_high: (P,) bounds; empty where the model takes no proprioception.
     """
 
     key: str
@@ -71,16 +74,19 @@ def pick_statistics(table: dict[str, Any], key: str | None, where: str) -> Stati
     key = key if key is not None else next(iter(table))
     if key not in table:
         raise CheckpointError(f"{where} has no statistics {key!r}, it holds {sorted(table)}")
+    entry = table[key]
     try:
-        action, proprio = table[key]["action"], table[key].get("proprio", {"q01": [], "q99": []})
-        low, high = np.asarray(action["q01"], np.float64), np.asarray(action["q99"], np.float64)
+        low_name, high_name = _BOUNDS[entry.get("normalization", "bounds_q99")]
+        action, proprio = entry["action"], entry.get("proprio", {low_name: [], high_name: []})
+        low = np.asarray(action[low_name], np.float64)
+        high = np.asarray(action[high_name], np.float64)
         return Statistics(
             key=key,
             action_low=low,
             action_high=high,
             action_mask=np.asarray(action.get("mask", [True] * len(low)), np.bool_),
-            proprio_low=np.asarray(proprio["q01"], np.float64),
-            proprio_high=np.asarray(proprio["q99"], np.float64),
+            proprio_low=np.asarray(proprio[low_name], np.float64),
+            proprio_high=np.asarray(proprio[high_name], np.float64),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(

@@ -107,7 +107,7 @@ class ViTTower(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """(B, 3, S, S) normalised pixels to (B, rows * columns, dim)."""
-        x = self.patch_embed(pixels) + self.pos_embed
+        x: Tensor = self.patch_embed(pixels) + self.pos_embed
         prefix = []
         if self.config.class_token:
             prefix.append(self.cls_token.expand(len(x), -1, -1))
@@ -131,7 +131,8 @@ class ConvBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(B, dim, h, w) to (B, dim, h, w)."""
         y = self.depthwise(x).permute(0, 2, 3, 1)
-        return x + self.mlp(self.norm(y)).permute(0, 3, 1, 2)
+        out: Tensor = x + self.mlp(self.norm(y)).permute(0, 3, 1, 2)
+        return out
 
 
 class ConvTower(nn.Module):
@@ -157,7 +158,8 @@ class ConvTower(nn.Module):
         x = self.down(self.stem_block(F.gelu(self.stem(x))))
         for block in self.blocks:
             x = block(x)
-        return x.permute(0, 2, 3, 1).flatten(1, 2)
+        out: Tensor = x.permute(0, 2, 3, 1).flatten(1, 2)
+        return out
 
 
 def build_tower(config: TowerConfig) -> ViTTower | ConvTower:

@@ -34,7 +34,7 @@ class VisionBackbone(nn.Module):
             cast(Tensor, self.get_submodule(name)(flat[:, 3 * i : 3 * i + 3]))
             for i, name in zip(range(len(self.config.towers)), TOWER_NAMES, strict=False)
         ]
-        tokens = torch.cat(features, dim=-1).unflatten(0, (batch, views))
+        tokens: Tensor = torch.cat(features, dim=-1).view(batch, views, -1, self.config.token_dim)
         if self.config.projector.positions == "sine2d":
             tokens = tokens + self.view_embed[:, None]
         return tokens.flatten(1, 2)

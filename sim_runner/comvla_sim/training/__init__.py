@@ -1,0 +1,1 @@
+"""Training of comvla-mini: demonstrations, and what is learnt from them."""

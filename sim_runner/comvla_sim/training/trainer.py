@@ -1,0 +1,210 @@
+"""The training loop: resumable, seeded, one thread or more on a CPU."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from comvla.errors import ComVLAError
+from comvla_vla.config import ModelConfig
+from comvla_vla.nets import join
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from comvla_sim.training.batches import Sampler
+from comvla_sim.training.objective import Learner, Weights
+
+
+class TrainingError(ComVLAError):
+    """A run that cannot start or go on; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that fixes a training run, so that two runs with one recipe are the same run.
+
+    Attributes:
+        seed: of weights, order of frames, numbers of tokens and random selections.
+        steps: optimiser steps. batch_size: pictures per step, each under two instructions.
+        learning_rate, warmup_steps, final_share: cosine schedule from the rate to ``final_share`` of it.
+        weight_decay: of matrices; vectors have none.
+        token_counts, token_shares: K drawn at each step, and how often.
+        random_share: how often the kept tokens are random instead of voted. 0 trains for votes only; 0.5 gives a
+            policy on which random selection is a fair control.
+        bfloat16: matrix products in bfloat16 (needs a CPU with such instructions to be faster).
+    """
+
+    seed: int = 0
+    steps: int = 4000
+    batch_size: int = 32
+    learning_rate: float = 1e-3
+    warmup_steps: int = 50
+    final_share: float = 0.03
+    weight_decay: float = 0.05
+    token_counts: tuple[int, ...] = (512, 128, 64, 32, 16)
+    token_shares: tuple[float, ...] = (0.04, 0.08, 0.20, 0.34, 0.34)
+    random_share: float = 0.0
+    bfloat16: bool = True
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One report of a running training; losses are means since the last report."""
+
+    step: int
+    steps: int
+    losses: dict[str, float]
+    pairs_per_second: float
+
+
+class Trainer:
+    """Trains both halves together on batches of a :class:`Sampler`.
+
+    Args:
+        config: of the policy. recipe: of the run.
+        folder: where checkpoints go (``state.safetensors``, ``state.json``).
+    """
+
+    def __init__(self, config: ModelConfig, recipe: Recipe, folder: Path) -> None:
+        self.config, self.recipe, self.folder = config, recipe, folder
+        torch.manual_seed(recipe.seed)
+        self.learner = Learner(*join(config))
+        matrices = [p for p in self.learner.parameters() if p.ndim >= 2]
+        vectors = [p for p in self.learner.parameters() if p.ndim < 2]
+        groups = [
+            {"params": matrices, "weight_decay": recipe.weight_decay},
+            {"params": vectors, "weight_decay": 0.0},
+        ]
+        self.optimizer = torch.optim.AdamW(groups, lr=recipe.learning_rate, betas=(0.9, 0.98))
+        self.step = 0
+        self.seconds = 0.0
+
+    def resume(self) -> bool:
+        """Takes up the last checkpoint of this folder; False where there is none.
+
+        Raises:
+            TrainingError: the folder belongs to a run with another recipe.
+        """
+        notes = self.folder / "state.json"
+        if not notes.is_file():
+            return False
+        state = json.loads(notes.read_text())
+        ours = json.loads(json.dumps(asdict(self.recipe)))
+        if state["recipe"] != ours:
+            changed = sorted(k for k in ours if state["recipe"].get(k) != ours[k])
+            raise TrainingError(
+                f"{self.folder} holds a run with another {', '.join(changed)}: choose another folder"
+            )
+        self.step, self.seconds = int(state["step"]), float(state["seconds"])
+        self._set_state(load_file(self.folder / f"state-{self.step}.safetensors"))
+        return True
+
+    def save(self) -> None:
+        """Writes a checkpoint; the notes name it only once it is whole."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        save_file(self._state(), self.folder / f"state-{self.step}.safetensors")
+        notes = {"step": self.step, "seconds": self.seconds, "recipe": asdict(self.recipe)}
+        partial = self.folder / "state.json.writing"
+        partial.write_text(json.dumps(notes))
+        partial.replace(self.folder / "state.json")
+        for old in self.folder.glob("state-*.safetensors"):
+            if old.name != f"state-{self.step}.safetensors":
+                old.unlink()
+
+    def run(
+        self,
+        sampler: Sampler,
+        report: Callable[[Progress], None],
+        report_every: int = 25,
+        save_every: int = 250,
+    ) -> None:
+        """Trains to the recipe's last step. Interrupting it keeps the last checkpoint."""
+        sums: dict[str, float] = {}
+        begun, count = time.monotonic(), 0
+        self.learner.train()
+        while self.step < self.recipe.steps:
+            started = time.monotonic()
+            for name, value in self._one_step(sampler).items():
+                sums[name] = sums.get(name, 0.0) + value
+            self.step, count = self.step + 1, count + 1
+            self.seconds += time.monotonic() - started
+            last = self.step == self.recipe.steps
+            if self.step % report_every == 0 or last:
+                rate = 2 * self.recipe.batch_size * count / (time.monotonic() - begun)
+                means = {name: value / count for name, value in sums.items()}
+                report(Progress(self.step, self.recipe.steps, means, rate))
+                sums, begun, count = {}, time.monotonic(), 0
+            if self.step % save_every == 0 or last:
+                self.save()
+
+    def losses(self, sampler: Sampler, frames: Any, k: int, selection: str) -> dict[str, float]:
+        """Loss terms on given frames without learning (validation)."""
+        generator = torch.Generator().manual_seed(0)
+        with torch.no_grad():
+            batch = sampler.of(frames, np.random.default_rng(0))
+            terms = self.learner(batch, k, selection, generator)
+        return {name: float(value.detach()) for name, value in terms.items()}
+
+    def _one_step(self, sampler: Sampler) -> dict[str, float]:
+        recipe, weights = self.recipe, Weights()
+        rng = np.random.default_rng((recipe.seed, 2, self.step))
+        shares = np.asarray(recipe.token_shares) / sum(recipe.token_shares)
+        k = int(rng.choice(recipe.token_counts, p=shares))
+        selection = "random" if rng.random() < recipe.random_share else "votes"
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        batch = sampler.batch(self.step, recipe.batch_size)
+        with torch.autocast("cpu", torch.bfloat16, enabled=recipe.bfloat16):
+            terms: dict[str, Tensor] = self.learner(batch, k, selection, generator)
+        loss = terms["action"] + weights.state * terms["state"]
+        loss = loss + weights.attention * terms["attention"] + weights.matching * terms["matching"]
+        if not torch.isfinite(loss):
+            raise TrainingError(
+                f"the loss is {float(loss)} at step {self.step}: lower the learning rate"
+            )
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(recipe, self.step)
+        self.optimizer.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        torch.nn.utils.clip_grad_norm_(self.learner.parameters(), 1.0)
+        self.optimizer.step()
+        return {name: float(value.detach()) for name, value in terms.items()}
+
+    def _state(self) -> dict[str, Tensor]:
+        tensors = {f"learner.{name}": value for name, value in self._own_state().items()}
+        for i, moments in self.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{i}.{name}": value for name, value in moments.items()}
+        return tensors
+
+    def _own_state(self) -> dict[str, Tensor]:
+        # The projector stands in both halves but is one module: save it once.
+        return {
+            k: v
+            for k, v in self.learner.state_dict().items()
+            if not k.startswith("cloud.projector.")
+        }
+
+    def _set_state(self, tensors: dict[str, Tensor]) -> None:
+        with torch.no_grad():
+            for name, value in self._own_state().items():
+                value.copy_(tensors[f"learner.{name}"])
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name, value in tensors.items():
+            if name.startswith("optimizer."):
+                _, index, kind = name.split(".")
+                moments.setdefault(int(index), {})[kind] = value
+        whole = self.optimizer.state_dict()
+        self.optimizer.load_state_dict({**whole, "state": moments})
+
+
+def learning_rate(recipe: Recipe, step: int) -> float:
+    """Linear warm-up, then a cosine down to ``final_share``."""
+    done = step / recipe.steps
+    cosine = recipe.final_share + (1 - recipe.final_share) * 0.5 * (1 + math.cos(math.pi * done))
+    return recipe.learning_rate * min(1.0, (step + 1) / recipe.warmup_steps) * cosine
