@@ -81,11 +81,10 @@ class CloudNet(nn.Module):
         """
         text = [self.embed_tokens(ids) for ids in prompts]
         tail = self._tail(text[0])
-        state: Sequence[Tensor]
-        if proprio is None:
-            state = [tail[:0]] * len(text)
-        else:
-            state = self.proprio_projector(proprio).unsqueeze(1).unbind(0)
+        nothing = [tail[:0]] * len(text)
+        state = (
+            nothing if proprio is None else self.proprio_projector(proprio).unsqueeze(1).unbind(0)
+        )
         rows, where = [], []
         for visual, at, words, body in zip(projected, positions, text, state, strict=True):
             rows.append(torch.cat([words[:1], visual, body, words[1:], tail]))
