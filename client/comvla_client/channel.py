@@ -1,0 +1,95 @@
+"""How a robot's gRPC channel is set up, and what its status codes are called here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import grpc
+from comvla import codec
+from comvla.errors import HandshakeError
+
+from comvla_client.errors import TransportError
+
+MAX_MESSAGE_BYTES = 16 * 2**20
+"""Largest message either way: 512 float32 tokens of width 2176 are 4.3 MiB."""
+
+FRESH_CHANNEL_AFTER = 2
+"""Unanswered calls in a row after which the connection is taken for dead and made anew."""
+
+CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
+    *codec.GRPC_OPTIONS,
+    ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    # A peer that vanished without a goodbye is noticed while the robot executes a chunk, not
+    # when it needs the next one.
+    ("grpc.keepalive_time_ms", 10_000),
+    ("grpc.keepalive_timeout_ms", 5_000),
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.max_pings_without_data", 0),
+    # gRPC's own pause between attempts grows to two minutes, in which a robot would stand still.
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.min_reconnect_backoff_ms", 1_000),
+    ("grpc.max_reconnect_backoff_ms", 1_000),
+    # A new channel must open a new connection, not share one that is waiting out a pause.
+    ("grpc.use_local_subchannel_pool", 1),
+    # Retries are counted in bytes and belong inside the deadline: this package makes them itself.
+    ("grpc.enable_retries", 0),
+    # An address on the robot's own network is never meant for a web proxy in the environment.
+    ("grpc.enable_http_proxy", 0),
+)
+
+
+def check_target(target: str) -> str:
+    """The address of a server, ``host:port``.
+
+    Raises:
+        HandshakeError: a web address, or no port.
+    """
+    host, _, port = target.rpartition(":")
+    if "://" in target or not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise HandshakeError(
+            f"expected a target host:port such as 127.0.0.1:50051, got {target!r}: give the gRPC "
+            "address that comvla-server prints when it is ready, without http://"
+        )
+    return target
+
+
+def retry_pauses_s() -> Iterator[float]:
+    """Seconds to wait before the second attempt, the third, and so on, inside one deadline."""
+    pause_s = 0.005
+    while True:
+        yield pause_s
+        pause_s = min(2 * pause_s, 0.05)
+
+
+def transport_error(error: grpc.RpcError) -> TransportError:
+    """A failed call in this package's words."""
+    code, details = error.code(), error.details()
+    return TransportError(code.name, details or "no details")
+
+
+def is_hopeless(error: TransportError) -> bool:
+    """Whether something answered at the address that will never be a ComVLA server."""
+    return error.code != "UNAVAILABLE" or "http1" in error.message.lower()
+
+
+def unanswered(timeout_s: float) -> TransportError:
+    """The error of a call that the robot stopped waiting for."""
+    return TransportError("DEADLINE_EXCEEDED", f"no answer within {timeout_s:.3f} s")
+
+
+def no_server(target: str, error: TransportError, budget_s: float) -> HandshakeError:
+    """Why a client could not be made, with host, budget and remedy."""
+    if error.code == "UNIMPLEMENTED":
+        found = "a gRPC server answered that offers no comvla.v1.PolicyService"
+    elif "http1" in error.message.lower():
+        found = "an HTTP/1 server answered, which is not gRPC"
+    elif error.code == "DEADLINE_EXCEEDED":
+        found = "nothing spoke gRPC in time"
+    else:
+        found = "no server was ready"
+    return HandshakeError(
+        f"expected a ComVLA server at {target} within {budget_s:g} s, but {found} "
+        f"({error.code}: {error.message}). Start one there with `comvla-server serve`, correct the "
+        "address, or allow more with connect_timeout_s; `comvla doctor` looks closer"
+    )

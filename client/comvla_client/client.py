@@ -1,0 +1,210 @@
+"""The robot's client: one call a step, actions back, whatever the link does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from types import TracebackType
+
+from comvla.model_info import ModelInfo
+
+from comvla_client import channel
+from comvla_client.budget import PAPER_LINK, LinkProfile
+from comvla_client.core import ClientCore, Prepared
+from comvla_client.edge import EdgeModel
+from comvla_client.errors import ClientClosedError, TransportError
+from comvla_client.observation import Observation
+from comvla_client.queue import Actions
+from comvla_client.report import ActionChunk
+from comvla_client.selection import Selector
+from comvla_client.sizing import Budget
+from comvla_client.snr import SnrInput, SnrReading
+from comvla_client.transport import GrpcTransport, Transport
+
+
+class ComVLAClient:
+    """Drives a robot through a policy server over a link that may be thin, late or gone.
+
+    The constructor shakes hands with the server and refuses a foreign model before the robot moves.
+    After that no state of the link or the server raises: a step without an answer gives the rest of
+    the last chunk, then holds, and recovers by itself. What raises is a mistake in the program: an
+    observation or instruction that does not fit, an SNR that is no number, a server that was
+    replaced by one with another model.
+
+    One client is one robot: steps of several threads run one after another. ``close`` may be called
+    from any thread at any time.
+
+    Args:
+        target: ``host:port`` of a server, or a transport of your own, which the client then owns.
+        edge: the robot's half of the model, e.g. ``comvla_vla.load_edge("mini")``.
+        link: bandwidth, period and efficiency of the radio link.
+        quantization: how token values are coded: float32, float16, int8 or int4.
+        selector: ranking of tokens, by name (:data:`comvla_client.selection.SELECTORS`) or your own.
+        budget: ``"paper"`` sizes payloads by Eq. (4), ``"framed"`` by all bytes that cross the wire;
+            a number sends that many tokens whatever the SNR.
+        snr: where the SNR in dB comes from when ``step`` is not told: a number, a function, or an
+            object with ``read()``.
+        deadline_s: longest that one ``step`` may take, edge half included, in seconds. Default: the
+            time in which the robot executes a chunk (``execute`` control periods of the model); a
+            later answer would be about a scene that the robot has left.
+        min_tokens: fewest tokens worth sending; below it a step counts as without a link.
+        execute: rows of each chunk that the robot executes before it asks again; default all H.
+        hold: (A,) action to hold with. Default: the last action with its velocities and deltas set
+            to zero, so that grippers keep their grip; all zeros before the first answer.
+        session_id: a name for this robot in the server's view; a random part is added.
+        seed: for selectors that draw; the same seed draws the same at each step of each episode.
+        connect_timeout_s: longest that the constructor waits for a server, in seconds.
+
+    Raises:
+        HandshakeError: no ComVLA server at the target in time, or one with another model.
+        ValueError: an option out of range.
+    """
+
+    def __init__(
+        self,
+        target: str | Transport,
+        *,
+        edge: EdgeModel,
+        link: LinkProfile = PAPER_LINK,
+        quantization: str = "int8",
+        selector: str | Selector = "hard_voting",
+        budget: Budget = "paper",
+        snr: SnrInput | None = None,
+        deadline_s: float | None = None,
+        min_tokens: int = 1,
+        execute: int | None = None,
+        hold: Sequence[float] | None = None,
+        session_id: str | None = None,
+        seed: int = 0,
+        connect_timeout_s: float = 5.0,
+    ) -> None:
+        self._core = ClientCore(
+            edge,
+            link=link,
+            quantization=quantization,
+            selector=selector,
+            budget=budget,
+            snr=snr,
+            deadline_s=deadline_s,
+            min_tokens=min_tokens,
+            execute=execute,
+            hold=hold,
+            session_id=session_id,
+            seed=seed,
+        )
+        self._lock = threading.RLock()
+        self._closed = False
+        self._transport = GrpcTransport(target) if isinstance(target, str) else target
+        try:
+            self._shake_hands(str(target), connect_timeout_s)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def info(self) -> ModelInfo:
+        """The model that both halves run."""
+        return self._core.info
+
+    @property
+    def deadline_s(self) -> float:
+        """Longest that one step may take, in seconds."""
+        return self._core.deadline_s
+
+    def step(
+        self, obs: Observation, instr: str, snr: float | SnrReading | None = None
+    ) -> ActionChunk:
+        """Asks for the next chunk of actions.
+
+        Args:
+            obs: ``images``: list of uint8 (H, W, 3) RGB in the model's view order; ``proprio``:
+                float (P,), raw.
+            instr: what the robot shall do.
+            snr: SNR of the link now, in dB (−inf: no link), or a reading with its age; None asks
+                the source that the client was made with.
+
+        Returns:
+            Actions (H, A), and the report of how they came about. Within ``deadline_s``.
+
+        Raises:
+            ObservationError, InstructionError, LinkError: input that cannot be used; nothing was sent.
+            HandshakeError: the server now runs another model.
+            ClientClosedError: the client is closed, before or during the step.
+        """
+        with self._lock:
+            self._check_open()
+            prepared = self._core.prepare(obs, instr, snr)
+            if prepared.request is None:
+                return self._core.fail(prepared)
+            return self._call(prepared)
+
+    def act(self, obs: Observation, instr: str, snr: float | SnrReading | None = None) -> Actions:
+        """The action for this control period: the next of the chunk, or of a new one.
+
+        Args:
+            obs: as for :meth:`step`; looked at only when the chunk is used up.
+            instr: as for :meth:`step`.
+            snr: as for :meth:`step`.
+
+        Returns:
+            (A,) float32.
+
+        Raises:
+            What :meth:`step` raises.
+        """
+        with self._lock:
+            self._check_open()
+            action = self._core.next_action()
+            if action is None:
+                self.step(obs, instr, snr)
+                action = self._core.next_action()
+            assert action is not None, "every chunk has a row to execute"
+            return action
+
+    def reset(self) -> None:
+        """Begins a new episode: forgets the chunk, starts a new session at step 0."""
+        with self._lock:
+            self._check_open()
+            self._core.reset()
+
+    def close(self) -> None:
+        """Ends a step under way in another thread with ClientClosedError and frees the connection."""
+        # Without the lock, which that step holds.
+        self._closed = True
+        self._transport.close()
+
+    def __enter__(self) -> ComVLAClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _shake_hands(self, target: str, connect_timeout_s: float) -> None:
+        try:
+            response = self._transport.get_model(connect_timeout_s)
+        except TransportError as error:
+            raise channel.no_server(target, error, connect_timeout_s) from error
+        self._core.accept_server(response)
+
+    def _call(self, prepared: Prepared) -> ActionChunk:
+        assert prepared.request is not None
+        remaining_s = prepared.remaining_s()
+        if remaining_s <= 0.0:
+            return self._core.fail(prepared, self._core.too_late(prepared))
+        sent = time.perf_counter()
+        try:
+            response = self._transport.infer(prepared.request, remaining_s)
+        except TransportError as error:
+            self._check_open()
+            return self._core.fail(prepared, error, time.perf_counter() - sent)
+        return self._core.complete(prepared, response, time.perf_counter() - sent)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ClientClosedError("the client is closed: make a new one")

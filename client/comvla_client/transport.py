@@ -1,0 +1,146 @@
+"""How a request reaches the server: the protocol that clients use, and gRPC as its default form."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any, Protocol
+
+import grpc
+from comvla.model_info import PROTOCOL_VERSION
+from comvla.v1 import policy_pb2_grpc
+from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
+
+from comvla_client import channel
+from comvla_client.errors import ClientClosedError, TransportError
+
+__all__ = ["GrpcTransport", "Transport", "TransportError"]
+
+
+class Transport(Protocol):
+    """Carries calls to a policy server. Wrap one to emulate a link, record, or inject faults."""
+
+    def get_model(self, timeout_s: float) -> GetModelResponse:
+        """The server's description of its model.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+        """
+        ...
+
+    def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
+        """Actions for one observation.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+        """
+        ...
+
+    def close(self) -> None:
+        """Ends calls under way and frees the connection. May be called from another thread."""
+        ...
+
+
+class GrpcTransport:
+    """Calls over gRPC. Every call has a deadline that a clock on this machine enforces as well.
+
+    Only UNAVAILABLE is tried again, within the deadline, and only because the server answers a
+    repeated (session, step) from its record. An attempt after a failure takes a new connection, so
+    the first call after a server's return finds it.
+
+    Args:
+        target: ``host:port``.
+
+    Raises:
+        HandshakeError: the target is no such address.
+    """
+
+    def __init__(self, target: str) -> None:
+        self.target = channel.check_target(target)
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._unanswered = 0
+        self._channel = self._new_channel()
+
+    def get_model(self, timeout_s: float) -> GetModelResponse:
+        """The server's description of its model; waits for one that is still starting.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+            ClientClosedError: the transport is closed.
+        """
+        request = GetModelRequest(protocol_version=PROTOCOL_VERSION)
+        answer: GetModelResponse = self._call("GetModel", request, timeout_s)
+        return answer
+
+    def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
+        """Actions for one observation.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+            ClientClosedError: the transport is closed, before or during the call.
+        """
+        answer: InferResponse = self._call("Infer", request, timeout_s)
+        return answer
+
+    def close(self) -> None:
+        """Ends calls under way with ClientClosedError. Closing twice does no harm."""
+        self._closed.set()
+        with self._lock:
+            self._channel.close()
+
+    def _call(self, method: str, request: Any, timeout_s: float) -> Any:
+        deadline = time.monotonic() + timeout_s
+        if self._unanswered >= channel.FRESH_CHANNEL_AFTER:
+            self._renew()
+        pauses_s = channel.retry_pauses_s()
+        while True:
+            try:
+                answer = self._attempt(method, request, deadline - time.monotonic())
+            except TransportError as error:
+                pause_s = next(pauses_s)
+                if channel.is_hopeless(error) or deadline - time.monotonic() <= pause_s:
+                    raise
+                if self._closed.wait(pause_s):
+                    raise self._closed_error() from error
+                self._renew()
+            else:
+                self._unanswered = 0
+                return answer
+
+    def _attempt(self, method: str, request: Any, timeout_s: float) -> Any:
+        if self._closed.is_set():
+            raise self._closed_error()
+        call = None
+        try:
+            with self._lock:
+                stub = policy_pb2_grpc.PolicyServiceStub(self._channel)
+            call = getattr(stub, method).future(request, timeout=timeout_s)
+            # gRPC's own timer may fire late; this wait does not.
+            return call.result(timeout=timeout_s)
+        except grpc.FutureTimeoutError:
+            assert call is not None
+            call.cancel()
+            self._unanswered += 1
+            raise channel.unanswered(timeout_s) from None
+        except (grpc.RpcError, grpc.FutureCancelledError, ValueError) as error:
+            # gRPC raises ValueError for a call on a channel that was closed meanwhile.
+            if self._closed.is_set() or not isinstance(error, grpc.RpcError):
+                raise self._closed_error() from error
+            failure = channel.transport_error(error)
+            self._unanswered += failure.code == "DEADLINE_EXCEEDED"
+            raise failure from error
+
+    def _renew(self) -> None:
+        with self._lock:
+            if self._closed.is_set():
+                return
+            stale, self._channel = self._channel, self._new_channel()
+            self._unanswered = 0
+        stale.close()
+
+    def _new_channel(self) -> grpc.Channel:
+        return grpc.insecure_channel(self.target, options=channel.CHANNEL_OPTIONS)
+
+    def _closed_error(self) -> ClientClosedError:
+        return ClientClosedError(f"the connection to {self.target} was closed: make a new client")

@@ -1,0 +1,126 @@
+"""The asyncio twin of :mod:`comvla_client.transport`."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Any, Protocol
+
+import grpc
+import grpc.aio
+from comvla.model_info import PROTOCOL_VERSION
+from comvla.v1 import policy_pb2_grpc
+from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
+
+from comvla_client import channel
+from comvla_client.errors import ClientClosedError, TransportError
+
+
+class AsyncTransport(Protocol):
+    """:class:`comvla_client.transport.Transport` with awaitable calls."""
+
+    async def get_model(self, timeout_s: float) -> GetModelResponse:
+        """The server's description of its model, or TransportError."""
+        ...
+
+    async def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
+        """Actions for one observation, or TransportError."""
+        ...
+
+    async def close(self) -> None:
+        """Ends calls under way and frees the connection."""
+        ...
+
+
+class GrpcAioTransport:
+    """:class:`comvla_client.transport.GrpcTransport` on the running event loop; the same rules.
+
+    Args:
+        target: ``host:port``.
+
+    Raises:
+        HandshakeError: the target is no such address.
+    """
+
+    def __init__(self, target: str) -> None:
+        self.target = channel.check_target(target)
+        self._closed = asyncio.Event()
+        self._unanswered = 0
+        self._channel: grpc.aio.Channel | None = None
+
+    async def get_model(self, timeout_s: float) -> GetModelResponse:
+        """The server's description of its model; waits for one that is still starting.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+            ClientClosedError: the transport is closed.
+        """
+        request = GetModelRequest(protocol_version=PROTOCOL_VERSION)
+        answer: GetModelResponse = await self._call("GetModel", request, timeout_s)
+        return answer
+
+    async def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
+        """Actions for one observation.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+            ClientClosedError: the transport is closed, before or during the call.
+        """
+        answer: InferResponse = await self._call("Infer", request, timeout_s)
+        return answer
+
+    async def close(self) -> None:
+        """Ends calls under way with ClientClosedError. Closing twice does no harm."""
+        self._closed.set()
+        await self._drop_channel()
+
+    async def _call(self, method: str, request: Any, timeout_s: float) -> Any:
+        deadline = time.monotonic() + timeout_s
+        if self._unanswered >= channel.FRESH_CHANNEL_AFTER:
+            await self._drop_channel()
+        pauses_s = channel.retry_pauses_s()
+        while True:
+            try:
+                answer = await self._attempt(method, request, deadline - time.monotonic())
+            except TransportError as error:
+                pause_s = next(pauses_s)
+                if channel.is_hopeless(error) or deadline - time.monotonic() <= pause_s:
+                    raise
+                await asyncio.sleep(pause_s)
+                await self._drop_channel()
+            else:
+                self._unanswered = 0
+                return answer
+
+    async def _attempt(self, method: str, request: Any, timeout_s: float) -> Any:
+        if self._closed.is_set():
+            raise self._closed_error()
+        if self._channel is None:
+            # Made here and not before, because a channel belongs to the loop that runs.
+            self._channel = grpc.aio.insecure_channel(self.target, options=channel.CHANNEL_OPTIONS)
+        call = getattr(policy_pb2_grpc.PolicyServiceStub(self._channel), method)
+        try:
+            # gRPC's own timer may fire late; this wait does not.
+            return await asyncio.wait_for(call(request, timeout=timeout_s), timeout_s)
+        except asyncio.TimeoutError:
+            self._unanswered += 1
+            raise channel.unanswered(timeout_s) from None
+        except (grpc.RpcError, grpc.aio.UsageError) as error:
+            if self._closed.is_set() or not isinstance(error, grpc.RpcError):
+                raise self._closed_error() from error
+            failure = channel.transport_error(error)
+            self._unanswered += failure.code == "DEADLINE_EXCEEDED"
+            raise failure from error
+        except asyncio.CancelledError as error:
+            # Closing the channel cancels its calls; a cancelled task is another matter.
+            if self._closed.is_set():
+                raise self._closed_error() from error
+            raise
+
+    async def _drop_channel(self) -> None:
+        stale, self._channel, self._unanswered = self._channel, None, 0
+        if stale is not None:
+            await stale.close()
+
+    def _closed_error(self) -> ClientClosedError:
+        return ClientClosedError(f"the connection to {self.target} was closed: make a new client")
