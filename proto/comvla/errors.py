@@ -1,4 +1,4 @@
-"""Every error of this project derives from :class:`ComVLAError`: one ``except`` catches them all."""
+"""Every error of this project derives from :class:`ComVLAError`, so one ``except`` catches all."""
 
 
 class ComVLAError(Exception):
