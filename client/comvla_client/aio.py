@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from types import TracebackType
 
 from comvla.model_info import ModelInfo
-
 from comvla_client import channel
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.core import ClientCore, Prepared

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+
 from comvla.errors import (
     CodecError,
     ComVLAError,
@@ -13,7 +14,6 @@ from comvla.errors import (
 )
 from comvla.model_info import ModelInfo
 from comvla.v1.policy_pb2 import InferRequest, InferResponse
-
 from comvla_client.errors import TransportError
 from comvla_client.report import FallbackReason
 

@@ -60,10 +60,6 @@ class LinkProfile:
         return bits_per_efficiency * _log2_one_plus(check_snr_db(snr_db))
 
 
-PAPER_LINK = LinkProfile()
-"""20 MHz, 50 ms, η = 0.38: the link of the paper's fading experiments."""
-
-
 def check_snr_db(snr_db: float) -> float:
     """The SNR as a float, if it is one that a link can have.
 
@@ -191,3 +187,7 @@ def _is_finite_number(value: object) -> bool:
         return math.isfinite(value)  # type: ignore[arg-type]
     except TypeError:
         return False
+
+
+PAPER_LINK = LinkProfile()
+"""20 MHz, 50 ms, η = 0.38: the link of the paper's fading experiments."""

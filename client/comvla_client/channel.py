@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import grpc
+
 from comvla import codec
 from comvla.errors import HandshakeError
-
 from comvla_client.errors import TransportError
 
 MAX_MESSAGE_BYTES = 16 * 2**20

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from comvla import codec
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
-
 from comvla_client.agreement import check_server
 from comvla_client.answers import fallback_reason, read_actions
 from comvla_client.budget import PAPER_LINK, LinkProfile

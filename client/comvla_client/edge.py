@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from comvla.model_info import ModelInfo
 
+from comvla.model_info import ModelInfo
 from comvla_client.arrays import Array
 
 
@@ -24,8 +24,8 @@ class EdgeModel(Protocol):
         """Visual tokens (N, D) of all views, each uint8 (H, W, 3)."""
         ...
 
-    def project(self, tokens: Array) -> Array:
-        """Tokens (N, D) in the language's space: (N, d)."""
+    def project(self, tokens: Any) -> Array:
+        """Tokens (N, D), of the kind that ``encode`` gives, in the language's space: (N, d)."""
         ...
 
     def text_queries(self, instruction: str) -> Array:

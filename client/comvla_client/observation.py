@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
 from comvla.errors import InstructionError, ObservationError
 from comvla.model_info import ModelInfo
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from comvla.model_info import ModelInfo
 
+from comvla.model_info import ModelInfo
 from comvla_client.report import Source
 
 Actions = npt.NDArray[np.float32]

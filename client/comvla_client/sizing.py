@@ -9,7 +9,6 @@ from comvla import codec
 from comvla.errors import LinkError
 from comvla.model_info import ModelInfo
 from comvla.v1.policy_pb2 import InferRequest
-
 from comvla_client.budget import LinkProfile, framed_token_budget, token_budget
 from comvla_client.snr import SnrReading
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Protocol, TypeAlias, runtime_checkable
 
 from comvla.errors import LinkError
-
 from comvla_client.budget import check_snr_db
 
 

@@ -7,10 +7,10 @@ import time
 from typing import Any, Protocol
 
 import grpc
+
 from comvla.model_info import PROTOCOL_VERSION
 from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
-
 from comvla_client import channel
 from comvla_client.errors import ClientClosedError, TransportError
 

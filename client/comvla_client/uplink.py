@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from comvla import codec
 
+from comvla import codec
 from comvla_client.arrays import Array, to_numpy
 from comvla_client.edge import EdgeModel
 from comvla_client.observation import CheckedObservation

@@ -1,0 +1,7 @@
+"""``python -m comvla_client`` is the command ``comvla``."""
+
+import sys
+
+from comvla_client.cli import main
+
+sys.exit(main())

@@ -1,0 +1,147 @@
+"""``comvla step``: one observation to a server and back, with the account of what it cost."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from comvla.errors import DependencyError, ObservationError
+from comvla.model_info import ModelInfo
+from comvla_client.client import ComVLAClient
+from comvla_client.commands.arguments import Subparsers, add_link, add_target, link_of, load_edge
+from comvla_client.report import ActionChunk
+from comvla_client.selection import SELECTORS
+
+_DESCRIPTION = """\
+Sends one observation and prints the actions and the report of the step.
+
+Without --image the observation is synthetic (noise from --seed): it exercises every part of the
+way, but the actions mean nothing.
+"""
+
+
+def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
+    """Adds ``step`` to the commands."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "step",
+        help="send one observation and print the report",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_target(parser)
+    parser.add_argument(
+        "--edge",
+        default="mini",
+        metavar="SOURCE",
+        help="robot's half of the model: mini, a folder or a hub repository (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--instruction",
+        default="push the green drawer shut",
+        metavar="WORDS",
+        help="what the robot shall do (default: %(default)r)",
+    )
+    parser.add_argument(
+        "--image",
+        action="append",
+        type=Path,
+        metavar="FILE",
+        help="picture of one camera; once per view, in the model's order",
+    )
+    parser.add_argument(
+        "--proprio",
+        type=float,
+        nargs="+",
+        metavar="X",
+        help="raw proprioception (default: zeros)",
+    )
+    parser.add_argument(
+        "--selector",
+        choices=sorted(SELECTORS),
+        default="hard_voting",
+        help="who ranks the tokens (default: %(default)s)",
+    )
+    parser.add_argument("--tokens", type=int, metavar="K", help="send K tokens whatever the SNR")
+    parser.add_argument(
+        "--deadline-s", type=float, metavar="S", help="longest that a step may take"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the synthetic observation")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_link(parser)
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Sends the observation. 0 when the cloud answered, 1 when the robot had to fall back."""
+    edge = load_edge(arguments.edge)
+    obs = _observation(arguments, edge.info)
+    with ComVLAClient(
+        arguments.target,
+        edge=edge,
+        link=link_of(arguments),
+        quantization=arguments.quantization,
+        selector=arguments.selector,
+        budget="paper" if arguments.tokens is None else arguments.tokens,
+        deadline_s=arguments.deadline_s,
+        connect_timeout_s=arguments.connect_timeout_s,
+        seed=arguments.seed,
+    ) as client:
+        chunk = client.step(obs, arguments.instruction, arguments.snr_db)
+    if arguments.json:
+        print(json.dumps({"actions": chunk.actions.tolist(), "report": chunk.report.to_dict()}))
+    else:
+        print(_text(chunk, edge.info))
+    return 0 if chunk.source == "cloud" else 1
+
+
+def _observation(arguments: argparse.Namespace, info: ModelInfo) -> dict[str, Any]:
+    if arguments.image:
+        images = [_read_image(path, info.image_size) for path in arguments.image]
+    else:
+        rng = np.random.default_rng(arguments.seed)
+        shape = (*info.image_size, 3)
+        images = [rng.integers(0, 256, shape, dtype=np.uint8) for _ in range(info.grid[0])]
+    return {"images": images, "proprio": arguments.proprio or [0.0] * info.proprio_dim}
+
+
+def _read_image(path: Path, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise DependencyError("reading pictures needs Pillow: pip install pillow") from error
+    try:
+        with Image.open(path) as picture:
+            height, width = size
+            return np.asarray(picture.convert("RGB").resize((width, height)))
+    except OSError as error:
+        raise ObservationError(
+            f"expected a picture in {path}, got: {error}; pass a PNG or JPEG file"
+        ) from error
+
+
+def _text(chunk: ActionChunk, info: ModelInfo) -> str:
+    report = chunk.report
+    milliseconds = {name: f"{1e3 * s:.1f}" for name, s in report.timings_s.items() if s}
+    server = {name: f"{1e3 * s:.1f}" for name, s in report.server_timings_s.items()}
+    answered = (
+        "from the cloud" if report.source == "cloud" else f"no answer: {report.fallback_reason}"
+    )
+    lines = [
+        f"model     {info.name} (N {info.num_tokens}, D {info.token_dim})",
+        f"source    {report.source} ({answered}{'; ' + report.detail if report.detail else ''})",
+        f"link      {report.snr_db} dB, {report.capacity_bits or 0:.0f} bits a period, "
+        f"K* {report.token_budget}",
+        f"sent      {report.tokens} tokens, {report.payload_bytes} B by the paper's accounting, "
+        f"{report.encoded_bytes} B coded, {report.framed_bytes} B framed",
+        f"robot ms  {' '.join(f'{k} {v}' for k, v in milliseconds.items())}",
+        f"server ms {' '.join(f'{k} {v}' for k, v in server.items()) or '-'}",
+        f"flops     edge {report.edge_flops:.3g}, cloud {report.cloud_flops:.3g}",
+        "actions",
+    ]
+    rows = [" ".join(f"{value:9.4f}" for value in row) for row in chunk.actions]
+    return "\n".join([*lines, *(f"  {row}" for row in rows)])
