@@ -1,0 +1,1 @@
+"""Closed-loop evaluations: worlds × conditions × methods × K × layouts, with intervals and tests."""

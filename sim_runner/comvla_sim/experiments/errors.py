@@ -1,0 +1,7 @@
+"""What can be wrong with an evaluation that was asked for."""
+
+from comvla.errors import ComVLAError
+
+
+class EvaluationError(ComVLAError, ValueError):
+    """An evaluation that cannot be run or resumed as asked; the message says what to change."""

@@ -1,0 +1,146 @@
+"""The file of results: one JSON object per line and episode, appended as episodes end."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.plan import EpisodeSpec
+
+try:
+    import fcntl
+except ImportError:  # a system without file locks
+    fcntl = None  # type: ignore[assignment]
+
+FORMAT = 1
+
+Row = dict[str, Any]
+
+
+def spec_of(row: Mapping[str, Any]) -> EpisodeSpec:
+    """The episode that a row reports."""
+    return EpisodeSpec(
+        condition=row["condition"],
+        method=row["method"],
+        k=row["k"],
+        task=row["task"],
+        episode=row["episode"],
+    )
+
+
+def read_rows(path: Path) -> tuple[list[Row], int]:
+    """The rows of a results file, and how many of its bytes hold complete ones.
+
+    A last line that was cut off by a crash is left out. Of rows about the same episode under the
+    same settings the first counts.
+
+    Raises:
+        EvaluationError: unreadable, or not a results file; the message names the line.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise EvaluationError(f"cannot read {path}: {error.strerror}") from error
+    rows: list[Row] = []
+    seen: set[tuple[str, EpisodeSpec]] = set()
+    complete = content.rfind(b"\n") + 1
+    for number, line in enumerate(content[:complete].splitlines(), start=1):
+        try:
+            row = json.loads(line)
+            key = (json.dumps(row["settings"], sort_keys=True), spec_of(row))
+        except (ValueError, KeyError, TypeError) as error:
+            raise EvaluationError(
+                f"{path}, line {number} is no result of comvla-sim eval ({error!r}): "
+                "name another file"
+            ) from error
+        if row.get("format") != FORMAT:
+            raise EvaluationError(
+                f"{path}, line {number} has format {row.get('format')!r}, this version reads "
+                f"{FORMAT}: run the evaluation again"
+            )
+        if key not in seen:
+            seen.add(key)
+            rows.append(row)
+    return rows, complete
+
+
+class ResultsFile:
+    """Appends results and knows which are there; a context manager.
+
+    Args:
+        path: made with its folders where it does not exist.
+        settings: what the rows must have been measured with (their ``settings``).
+
+    Attributes:
+        rows: by episode.
+
+    Raises:
+        EvaluationError: the file holds results of other settings, is no results file, or is being
+            written by another process.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
+        self.path = path
+        self.rows: dict[EpisodeSpec, Row] = {}
+        self._settings = dict(settings)
+        self._file: TextIO | None = None
+        complete = 0
+        if path.exists():
+            rows, complete = read_rows(path)
+            for row in rows:
+                self._require_same_settings(row)
+                self.rows[spec_of(row)] = row
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = path.open("a", encoding="utf-8")
+        except OSError as error:
+            raise EvaluationError(f"cannot write {path}: {error.strerror}") from error
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                file.close()
+                raise EvaluationError(
+                    f"{path} is being written by another evaluation: wait for it, or name "
+                    "another file with --out"
+                ) from error
+        if os.fstat(file.fileno()).st_size > complete:
+            file.truncate(complete)  # a line that a crash cut off
+        self._file = file
+
+    def _require_same_settings(self, row: Row) -> None:
+        found = row["settings"]
+        for key in sorted({*found, *self._settings}):
+            if found.get(key) != self._settings.get(key):
+                raise EvaluationError(
+                    f"{self.path} was measured with {key} {found.get(key)!r}, this evaluation has "
+                    f"{self._settings.get(key)!r}: name another file with --out, or use the same "
+                    "settings"
+                )
+
+    def append(self, row: Row) -> None:
+        """Writes one row through to the file."""
+        if self._file is None:
+            raise ValueError("the results file is closed")
+        self._file.write(json.dumps(row, allow_nan=False) + "\n")
+        self._file.flush()
+        self.rows[spec_of(row)] = row
+
+    def close(self) -> None:
+        """Harmless when repeated."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> ResultsFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Row]:
+        return iter(self.rows.values())

@@ -1,0 +1,197 @@
+"""One episode in closed loop: world, client, transport, and what is measured on the way."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from comvla_client import ComVLAClient, StepReport
+from comvla_client.edge import EdgeModel
+from comvla_client.transport import Transport
+from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.layouts import evaluation_layout, foreign_layout
+from comvla_sim.experiments.observing import ObservedEdge, SelectionStatistics
+from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
+from comvla_sim.experiments.selectors import METHODS
+from comvla_sim.worlds.base import Task, World
+
+Pictures = npt.NDArray[np.uint8]
+
+# Simulated time stands still while the policy thinks; a slow machine must not change results.
+_DEADLINE_S = 600.0
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Who plays which part in an episode under its condition.
+
+    Attributes:
+        task: the one that counts as success.
+        other: a task about another fixture of the same table; None where there is none.
+        spoken: the task whose instruction the robot is given.
+        heard: the task whose instruction selects tokens instead of the spoken one; None: the same.
+    """
+
+    task: Task
+    other: Task | None
+    spoken: Task
+    heard: Task | None
+
+
+def cast(world: World, spec: EpisodeSpec, layout_seed: int) -> Roles:
+    """Who plays which part; the layout must be on the table.
+
+    Raises:
+        EvaluationError: the condition needs another fixture and the table has none.
+    """
+    task = world.find_task(spec.task)
+    others = [t for t in world.possible_tasks() if t.fixture != task.fixture]
+    other: Task | None = None
+    if others:
+        # Drawn from the layout and the task alone, so it is the same for every method and K.
+        random = np.random.RandomState([layout_seed, world.tasks.index(task)])
+        other = others[random.randint(len(others))]
+    if spec.condition in ("wrong_instruction", "wrong_selection") and other is None:
+        raise EvaluationError(
+            f"--condition {spec.condition} names another fixture on the table, and this world "
+            "shows one only: leave the condition out, or use --world tabletop"
+        )
+    named_wrongly = spec.condition == "wrong_instruction"
+    return Roles(
+        task=task,
+        other=other,
+        spoken=other if named_wrongly and other is not None else task,
+        heard=other if spec.condition == "wrong_selection" else None,
+    )
+
+
+def expert_pictures(world: World, task: str, layout_seed: int, every: int) -> list[Pictures]:
+    """What the cameras saw while the expert did ``task`` elsewhere, one entry each ``every`` steps.
+
+    The world is reset to that layout and left wherever the expert got.
+    """
+    observation, _ = world.reset(seed=layout_seed, options={"task": task})
+    pictures = [observation["images"]]
+    for step in range(1, world.max_episode_steps + 1):
+        world.advance(world.expert_action())
+        done = world.successes()[task]
+        if step % every == 0 or done:
+            pictures.append(world.observe()["images"])
+        if done:
+            break
+    return pictures
+
+
+class _Totals:
+    """Sums over an episode's queries."""
+
+    def __init__(self) -> None:
+        self.queries = 0
+        self.fallbacks = 0
+        self.payload_bytes = 0
+        self.encoded_bytes = 0
+        self.framed_bytes = 0
+        self.edge_flops = 0.0
+        self.cloud_flops = 0.0
+
+    def add(self, report: StepReport) -> None:
+        self.queries += 1
+        self.fallbacks += report.fallback_reason is not None
+        self.payload_bytes += report.payload_bytes
+        self.encoded_bytes += report.encoded_bytes
+        self.framed_bytes += report.framed_bytes
+        self.edge_flops += report.edge_flops
+        self.cloud_flops += report.cloud_flops
+
+
+def run_episode(
+    world: World,
+    edge: EdgeModel,
+    target: Transport | str,
+    spec: EpisodeSpec,
+    settings: EvalSettings,
+) -> dict[str, Any]:
+    """Runs one episode and returns what it measured, as plain JSON values.
+
+    Conditions: ``normal``; ``blind`` shows the pictures of an expert that does the same task in
+    another layout; ``wrong_instruction`` speaks the instruction of another fixture on the table,
+    and the episode then ends when *that* task is done; ``wrong_selection`` selects tokens by
+    another fixture's instruction and sends the right one.
+
+    Args:
+        world: is reset here.
+        edge: the robot's half.
+        target: a transport or ``host:port``.
+        spec: which episode.
+        settings: of the evaluation.
+
+    Raises:
+        EvaluationError: the condition is impossible here, or the server fell silent.
+        ObservationError, InstructionError, HandshakeError: world, policy and server do not fit.
+    """
+    started = time.perf_counter()
+    layout_seed = evaluation_layout(settings.seed, spec.episode)
+    film: list[Pictures] = []
+    if spec.condition == "blind":
+        elsewhere = foreign_layout(settings.seed, spec.episode)
+        film = expert_pictures(world, spec.task, elsewhere, edge.info.action_horizon)
+    observation, _ = world.reset(seed=layout_seed, options={"task": spec.task})
+    roles = cast(world, spec, layout_seed)
+    observed = ObservedEdge(edge, roles.heard.instruction if roles.heard else None)
+    selector = METHODS[spec.method]()
+    compared = roles.other if spec.condition == "normal" else None
+    statistics = SelectionStatistics(
+        observed, selector, compared.instruction if compared else None, layout_seed
+    )
+    totals = _Totals()
+    success = other_success = False
+    steps = 0
+    with ComVLAClient(
+        target,
+        edge=observed,
+        selector=selector,
+        budget=spec.k,
+        quantization=settings.quantization,
+        deadline_s=_DEADLINE_S,
+        seed=layout_seed,
+    ) as client:
+        while steps < world.max_episode_steps:
+            pictures = film[min(totals.queries, len(film) - 1)] if film else observation["images"]
+            shown = {"images": list(pictures), "proprio": observation["proprio"]}
+            chunk = client.step(shown, roles.spoken.instruction)
+            totals.add(chunk.report)
+            if chunk.report.fallback_reason is not None:
+                raise EvaluationError(
+                    f"the policy gave no answer ({chunk.report.fallback_reason}: "
+                    f"{chunk.report.detail}): check the server, then run the same command again"
+                )
+            statistics.add(chunk.report.positions, None if film else world, roles.spoken)
+            for action in chunk.actions[: world.max_episode_steps - steps]:
+                world.advance(action)
+                steps += 1
+                fulfilled = world.successes()
+                success |= fulfilled[roles.task.name]
+                other_success |= roles.other is not None and fulfilled[roles.other.name]
+                ended = fulfilled[roles.spoken.name]
+                if ended:
+                    break
+            if ended:
+                break
+            observation = world.observe()
+    return {
+        "layout_seed": layout_seed,
+        "instruction": roles.task.instruction,
+        "spoken": roles.spoken.instruction,
+        "heard": (roles.heard or roles.spoken).instruction,
+        "other_task": roles.other.name if roles.other else None,
+        "success": success,
+        "other_success": other_success if roles.other else None,
+        "steps": steps,
+        **vars(totals),
+        "selection": statistics.as_dict(),
+        "wall_s": round(time.perf_counter() - started, 3),
+    }
