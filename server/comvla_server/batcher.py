@@ -137,16 +137,15 @@ class Batcher:
         ticket.deadline_s = max(ticket.deadline_s, deadline_s)
         ticket.callers += 1
         try:
-            outcome = await asyncio.wait_for(
-                asyncio.shield(ticket.outcome), max(0.0, deadline_s - self._clock())
-            )
-        except asyncio.TimeoutError:
-            raise _too_late(ticket) from None
+            remaining_s = max(0.0, deadline_s - self._clock())
+            # Unlike wait_for, wait leaves the outcome alone when this caller gives up.
+            await asyncio.wait([ticket.outcome], timeout=remaining_s)
         finally:
             ticket.callers -= 1
             session = self._queue.get(ticket.session_id)
             if ticket.callers == 0 and session is not None and session.queued is ticket:
                 self._take(session).resolve(_too_late(ticket))
+        outcome = ticket.outcome.result() if ticket.outcome.done() else _too_late(ticket)
         if isinstance(outcome, Refusal):
             raise outcome
         return outcome

@@ -10,14 +10,14 @@ from prometheus_client.process_collector import ProcessCollector
 
 from comvla_server.refusals import Reason
 
-# 1 to 500 ms: control periods are tens of milliseconds, anything above is a miss.
+# 1 to 500 ms: a control period is tens of milliseconds, anything above is a miss.
 SECONDS_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5)
 TOKEN_BUCKETS = (1, 4, 8, 16, 32, 48, 64, 96, 128, 256, 512)
 BATCH_BUCKETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
 
 class Metrics:
-    """All counters of one server, in a registry of its own, so that two servers can share a process.
+    """All counters of one server, in a registry of its own: two servers can share a process.
 
     TX is the robot's transmission, seen from the server: counted for every call that arrived,
     repeats and refused calls included, because they crossed the link too. Three sizes that must not
