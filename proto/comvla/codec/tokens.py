@@ -61,7 +61,8 @@ def encode(
     if count:
         records = record_views(payload, quantizer, towers, count)
         records.positions[...] = places
-        quantizer.quantize(tokens, tower_slices(towers), records.scales, records.values)
+        with np.errstate(all="ignore"):
+            quantizer.quantize(tokens, tower_slices(towers), records.scales, records.values)
     return payload.tobytes()
 
 
@@ -119,8 +120,10 @@ def decode(
     records = record_views(np.frombuffer(data, "u1"), quantizer, header.tower_dims, count)
     positions = records.positions.astype(np.int32)
     _require_places(positions, MAX_TOKENS if num_tokens is None else min(num_tokens, MAX_TOKENS))
-    towers = tower_slices(header.tower_dims)
-    return quantizer.dequantize(records.scales, records.values, towers), positions
+    with np.errstate(all="ignore"):
+        towers = tower_slices(header.tower_dims)
+        tokens = quantizer.dequantize(records.scales, records.values, towers)
+    return tokens, positions
 
 
 def _check_tokens(tokens: NDArray[np.float32]) -> None:

@@ -5,10 +5,10 @@ How a message is split is decided by the *receiver*, who advertises the largest 
 flow-control window. By default gRPC changes both while it runs, from round-trip measurements of
 its own, and no formula is exact. With :data:`GRPC_OPTIONS` on both ends they stay put:
 
-* a message up to ``WRITE_BYTES`` (128 KiB: 59 INT8 tokens of the paper's width) is cut at every
-  ``HTTP2_FRAME_BYTES``, and :func:`wire_bytes` is exact;
-* a longer one is handed to the socket in pieces, the first of 128 KiB, and a frame also ends where
-  a piece does. That adds at most one frame, 9 bytes, for each piece, and most often none.
+* a call that fits into ``WRITE_BYTES`` (128 KiB: 59 INT8 tokens of the paper's width) is cut at
+  every ``HTTP2_FRAME_BYTES``, and :func:`wire_bytes` is exact;
+* a longer one is handed to the socket in pieces, and a frame also ends where a piece does. That
+  adds at most one frame, 9 bytes, for each piece, and most often none.
 
 Towards a server without these options gRPC uses larger frames, and so fewer: the figure is then
 above the truth by at most 9 bytes in 16 KiB. Measured with grpcio 1.62 and 1.85.
@@ -23,7 +23,11 @@ HTTP2_FRAME_BYTES = 16_384
 """Largest DATA frame that a receiver advertises unless told otherwise (RFC 9113, 6.5.2)."""
 
 WRITE_BYTES = 131_072
-"""What gRPC hands to the socket at once on a new connection; it grows on a fast link."""
+"""What gRPC hands to the socket at once on a new connection.
+
+It grows on a fast link, and shrinks where such a piece takes longer than a second (gRPC's
+``src/core/ext/transport/chttp2/transport/write_size_policy.h``).
+"""
 
 CALL_HEADERS_BYTES = 56
 """What a call sends besides DATA on a connection in use: HEADERS and WINDOW_UPDATE, at most.
