@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -142,16 +142,19 @@ def generate(
         return
     # Spawned, not forked: a forked OpenGL context does not work.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(todo)), mp_context=context)
-    try:
-        futures = [pool.submit(_record_shard, folder, part, recording) for folder, part in todo]
-        for future in as_completed(futures):
-            shard = future.result()
-            done, frames = done + len(shard["layouts"]), frames + int(shard["frames"])
-            report()
-    finally:
-        # Also reached by Ctrl-C and by a worker's error: begin no further shard.
-        pool.shutdown(wait=True, cancel_futures=True)
+    with ProcessPoolExecutor(min(workers, len(todo)), mp_context=context) as pool:
+        running: set[Future[dict[str, Any]]] = set()
+        while todo or running:
+            # A shard for every worker and none in advance: after Ctrl-C or a worker's error
+            # nothing waits in the queue that would still be recorded.
+            while todo and len(running) < workers:
+                folder, members = todo.pop(0)
+                running.add(pool.submit(_record_shard, folder, members, recording))
+            finished, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in finished:
+                shard = future.result()
+                done, frames = done + len(shard["layouts"]), frames + int(shard["frames"])
+                report()
 
 
 class Demonstrations:

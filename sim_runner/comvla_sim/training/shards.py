@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from comvla.errors import ComVLAError
 
+from comvla.errors import ComVLAError
 from comvla_sim.training.recording import Frames, Recording
 from comvla_sim.worlds import make
 
