@@ -74,7 +74,7 @@ class ActionQueue:
             (H, A) actions, how many leading rows come from the last chunk, and where they come from.
             It is taken as given that the robot executes ``execute`` rows before it asks again.
         """
-        rest = self._nothing_yet[None, :0] if self._chunk is None else self._chunk[self._started :]
+        rest = self._nothing_yet[None][:0] if self._chunk is None else self._chunk[self._started :]
         self._started += self.execute
         actions = np.tile(self._hold_action(), (self.horizon, 1))
         planned = len(rest)
