@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from typing import Annotated
 
-from comvla import codec
-from comvla.model_info import PROTOCOL_VERSION
 from fastapi import FastAPI, HTTPException, Query, Request, Response
 from prometheus_client.exposition import choose_encoder
 from pydantic import BaseModel
 
+from comvla import codec
+from comvla.model_info import PROTOCOL_VERSION
 from comvla_server.lifecycle import Lifecycle, Phase
 from comvla_server.metrics import Metrics
 from comvla_server.service import PolicyService, Runtime

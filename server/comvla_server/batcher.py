@@ -11,8 +11,6 @@ import contextlib
 import time
 from collections.abc import Callable, Sequence
 
-from comvla_vla.request import PolicyRequest
-
 from comvla_server.busy import BusyMeter
 from comvla_server.engine import Engine
 from comvla_server.inference_thread import InferenceThread
@@ -21,6 +19,7 @@ from comvla_server.passes import Pass, run_pass
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.sessions import Session, SessionTable, superseded
 from comvla_server.tickets import Answer, Ticket
+from comvla_vla.request import PolicyRequest
 
 
 class Batcher:

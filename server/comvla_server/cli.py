@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 
 from comvla.errors import ComVLAError
-
 from comvla_server import inspect_command, serve_command
 from comvla_server.version import server_version
 

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+
 from comvla.model_info import ModelInfo
 from comvla_vla.request import PolicyRequest
-from numpy.typing import NDArray
 
 # Id 1 begins a sequence in every vocabulary that this project builds or loads.
 _BOS_ID = 1

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import grpc
-from comvla import codec
-from comvla.v1 import policy_pb2
 from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from comvla import codec
+from comvla.v1 import policy_pb2
 from comvla_server.service import STATUS, PolicyService
 from comvla_server.settings import ServerSettings
 

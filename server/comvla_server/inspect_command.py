@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from comvla import codec
-
-from comvla_server.engine import Engine
 from comvla_server.serve_command import load_engine
+
+if TYPE_CHECKING:  # torch takes seconds to import: --help does without it
+    from comvla_server.engine import Engine
 
 _DESCRIPTION = """\
 Load the cloud half of a checkpoint and describe it: sizes, fingerprint, and for several numbers

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.process_collector import ProcessCollector
 
+from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla_server.refusals import Reason
 
 # 1 to 500 ms: a control period is tens of milliseconds, anything above is a miss.

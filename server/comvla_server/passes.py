@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from comvla_vla.request import PolicyRequest
 from numpy.typing import NDArray
 
 from comvla_server.engine import Engine
 from comvla_server.metrics import Metrics
+from comvla_vla.request import PolicyRequest
 
 _log = logging.getLogger(__name__)
 

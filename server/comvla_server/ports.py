@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 
 import grpc
+
 from comvla.errors import ComVLAError
 
 

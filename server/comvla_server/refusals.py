@@ -5,7 +5,6 @@ from __future__ import annotations
 from enum import Enum
 
 from comvla.errors import ComVLAError
-
 from comvla_server.wording import one_line
 
 

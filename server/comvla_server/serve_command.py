@@ -7,12 +7,14 @@ import asyncio
 import contextlib
 import os
 import signal
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from comvla_server import logs
-from comvla_server.engine import Engine
-from comvla_server.server import Server
 from comvla_server.settings import ServerSettings
+
+if TYPE_CHECKING:  # torch takes seconds to import: --help does without it
+    from comvla_server.engine import Engine
 
 DEFAULT_PORT = 50051
 DEFAULT_ADMIN_PORT = 8080
@@ -136,6 +138,8 @@ def load_engine(model: str, device: str, dtype: str, threads: int | None) -> Eng
         CheckpointError: missing, damaged, foreign or incomplete.
     """
     import torch
+
+    from comvla_server.engine import Engine
     from comvla_vla import load_cloud
 
     if threads is not None:
@@ -143,7 +147,9 @@ def load_engine(model: str, device: str, dtype: str, threads: int | None) -> Eng
     return Engine(load_cloud(model, device=device, dtype=getattr(torch, dtype)))
 
 
-async def _serve(settings: ServerSettings, load: Any) -> int:
+async def _serve(settings: ServerSettings, load: Callable[[], Engine]) -> int:
+    from comvla_server.server import Server
+
     stop = _stop_on_signals()
     server = Server(load, settings)
     await server.bind()

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 
 import grpc
 import uvicorn
+
 from comvla import codec
 from comvla.model_info import ModelInfo
-
 from comvla_server.admin import create_app
 from comvla_server.batcher import Batcher
 from comvla_server.engine import Engine

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import grpc
+
 from comvla import codec, handshake
 from comvla.errors import CodecError
 from comvla.v1 import policy_pb2, policy_pb2_grpc
-
 from comvla_server.batcher import Batcher
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle

@@ -6,10 +6,10 @@ import asyncio
 from dataclasses import dataclass, field
 
 import numpy as np
-from comvla_vla.request import PolicyRequest
 from numpy.typing import NDArray
 
 from comvla_server.refusals import Refusal
+from comvla_vla.request import PolicyRequest
 
 
 @dataclass(frozen=True)

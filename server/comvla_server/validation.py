@@ -9,16 +9,16 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from comvla import codec
 from comvla.errors import CodecError, InstructionError
 from comvla.model_info import PROTOCOL_VERSION
 from comvla.v1 import policy_pb2
-from comvla_vla.request import PolicyRequest
-from numpy.typing import NDArray
-
 from comvla_server.engine import Engine
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.wording import shown
+from comvla_vla.request import PolicyRequest
 
 MAX_SESSION_ID_CHARS = 128
 MAX_INSTRUCTION_CHARS = 2000

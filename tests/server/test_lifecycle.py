@@ -170,7 +170,9 @@ def test_a_taken_port_is_named_and_nothing_is_half_started(cloud: StubCloud, opt
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         server = BackgroundServer(Engine(cloud), ServerSettings(**{option: port}))
-        with pytest.raises(BindError, match=f"cannot listen on 127.0.0.1:{port}.*0 takes a free"):
+        with pytest.raises(
+            BindError, match=rf"cannot listen on 127\.0\.0\.1:{port}.*0 takes a free"
+        ):
             server.start()
     assert cloud.batches == []
     # Whatever the failed start had taken is free again.

@@ -24,9 +24,13 @@ VALIDATOR = Validator(Engine(StubCloud()), max_request_bytes=4096)
 def refusal(**changes: Any) -> Refusal:
     """Why a request with these changes is not read."""
     request = message(**changes)
-    with pytest.raises(Refusal) as caught:
+
+    def check() -> None:
         VALIDATOR.check_identity(request)
         VALIDATOR.read(request)
+
+    with pytest.raises(Refusal) as caught:
+        check()
     return caught.value
 
 

@@ -1,0 +1,195 @@
+"""Hostile bytes: mutated requests never crash the server and meet documented statuses only."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import math
+import random
+import socket
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import grpc
+import httpx
+from server_stubs import PATIENCE_S, STUB_INFO, Robot, message
+
+from comvla import codec
+from comvla.model_info import ModelInfo
+from comvla.v1 import policy_pb2
+from comvla_server.background import BackgroundServer
+from comvla_server.engine import Engine
+from comvla_server.service import STATUS
+from comvla_vla import random_policy
+
+REQUESTS = 10_500
+CONCURRENCY = 32
+DOCUMENTED = {grpc.StatusCode.OK, *STATUS.values()}
+# A mutated request breaks neither the server nor the model, so it is never the server's fault.
+EXPECTED = DOCUMENTED - {grpc.StatusCode.INTERNAL, grpc.StatusCode.UNAVAILABLE}
+
+TEXTS = ("", " ", "open it", "\x00", "a" * 3000, "ж" * 500, "a\r\nb", "%s%n{}", "../..", "\u202e")
+FLOATS = (0.0, -0.0, math.nan, math.inf, -math.inf, 1e38, -1e38, 1e-45, 1.0)
+INTEGERS = (0, 1, 2, 7, 255, 256, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
+
+
+def mutated_message(rng: random.Random, info: ModelInfo, instructions: Sequence[str]) -> bytes:
+    """A valid request in which one to three fields were replaced."""
+    request = message(
+        f"s{rng.randrange(3000)}",
+        rng.randrange(4),
+        k=rng.randrange(17),
+        quantization=rng.choice(codec.QUANTIZATIONS),
+        info=info,
+        instruction=rng.choice(instructions),
+    )
+    for _ in range(rng.randint(1, 3)):
+        rng.choice(FIELD_MUTATIONS)(request, rng)
+    return request.SerializeToString()
+
+
+def _text(request: policy_pb2.InferRequest, rng: random.Random) -> None:
+    name = rng.choice(("session_id", "instruction", "model_fingerprint"))
+    setattr(request, name, rng.choice(TEXTS))
+
+
+def _number(request: policy_pb2.InferRequest, rng: random.Random) -> None:
+    if rng.random() < 0.5:
+        request.step = rng.choice(INTEGERS)
+    else:
+        request.protocol_version = rng.choice(INTEGERS) % 2**32
+
+
+def _proprio(request: policy_pb2.InferRequest, rng: random.Random) -> None:
+    del request.proprio[:]
+    request.proprio.extend(rng.choice(FLOATS) for _ in range(rng.choice((0, 1, 2, 2, 2, 3, 500))))
+
+
+def _link(request: policy_pb2.InferRequest, rng: random.Random) -> None:
+    request.snr_db = rng.choice(FLOATS)
+    request.snr_age_s = rng.choice(FLOATS)
+
+
+def _payload(request: policy_pb2.InferRequest, rng: random.Random) -> None:
+    request.payload = mutated_bytes(request.payload, rng)
+
+
+def _payload_header(request: policy_pb2.InferRequest, rng: random.Random) -> None:
+    """Lies in the header: version, quantization, towers, widths, counts."""
+    content = bytearray(request.payload)
+    at = rng.randrange(4, 16)
+    content[at : at + 2] = struct.pack("<H", rng.choice((0, 1, 2, 8, 16, 255, 4096, 65535)))
+    request.payload = bytes(content)
+
+
+def _payload_values(request: policy_pb2.InferRequest, rng: random.Random) -> None:
+    """Not finite or huge where a scale or a value may be."""
+    content = bytearray(request.payload)
+    if len(content) > 24:
+        at = rng.randrange(16, len(content) - 4)
+        content[at : at + 4] = struct.pack("<f", rng.choice(FLOATS))
+    request.payload = bytes(content)
+
+
+FIELD_MUTATIONS = (_text, _number, _proprio, _link, _payload, _payload_header, _payload_values)
+
+
+def mutated_bytes(data: bytes, rng: random.Random) -> bytes:
+    """Flipped, cut, doubled, inserted or replaced bytes."""
+    content = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(content) + 1)
+        match rng.randrange(5):
+            case 0 if content:
+                content[at % len(content)] ^= 1 << rng.randrange(8)
+            case 1:
+                del content[at:]
+            case 2:
+                content[at:at] = content[: rng.randrange(64)]
+            case 3:
+                content[at:at] = rng.randbytes(rng.randrange(16))
+            case _:
+                content[at : at + 4] = rng.randbytes(4)
+    return bytes(content)
+
+
+def hostile(rng: random.Random, info: ModelInfo, instructions: Sequence[str]) -> bytes:
+    """Bytes for the Infer method."""
+    kind = rng.random()
+    if kind < 0.7:
+        return mutated_message(rng, info, instructions)
+    if kind < 0.95:
+        return mutated_bytes(message(k=rng.randrange(5), info=info).SerializeToString(), rng)
+    return rng.randbytes(rng.randrange(300))
+
+
+async def attack(
+    target: str,
+    seed: int,
+    requests: int,
+    info: ModelInfo = STUB_INFO,
+    instructions: Sequence[str] = ("open it",),
+) -> tuple[collections.Counter[Any], list[str]]:
+    """Statuses of all calls, and the messages of the refused ones."""
+    rng = random.Random(seed)
+    data_of_calls = iter([hostile(rng, info, instructions) for _ in range(requests)])
+    statuses: collections.Counter[Any] = collections.Counter()
+    messages: list[str] = []
+    async with grpc.aio.insecure_channel(target) as channel:
+        infer = channel.unary_unary("/comvla.v1.PolicyService/Infer")
+
+        async def worker() -> None:
+            for data in data_of_calls:
+                try:
+                    answer = policy_pb2.InferResponse.FromString(
+                        await infer(data, timeout=PATIENCE_S)
+                    )
+                    assert all(math.isfinite(a) for a in answer.actions)
+                    statuses[grpc.StatusCode.OK] += 1
+                except grpc.aio.AioRpcError as error:
+                    statuses[error.code()] += 1
+                    messages.append(error.details() or "")
+
+        await asyncio.gather(*(worker() for _ in range(CONCURRENCY)))
+    return statuses, messages
+
+
+def test_ten_thousand_mutated_requests_do_no_harm(server: BackgroundServer, robot: Robot) -> None:
+    statuses, messages = asyncio.run(attack(server.target, seed=20, requests=REQUESTS))
+    assert sum(statuses.values()) == REQUESTS
+    assert set(statuses) <= EXPECTED, statuses
+    # The mutations reach every layer, valid requests among them.
+    assert statuses[grpc.StatusCode.OK] > REQUESTS / 100
+    assert statuses[grpc.StatusCode.INVALID_ARGUMENT] > REQUESTS / 10
+    assert statuses[grpc.StatusCode.FAILED_PRECONDITION] > REQUESTS / 100
+    assert all(text and text.isprintable() and len(text) <= 1000 for text in messages)
+
+    assert len(robot.infer(message("afterwards")).actions) == 6
+    assert httpx.get(f"{server.admin_url}/healthz").status_code == 200
+    metrics = httpx.get(f"{server.admin_url}/metrics").text
+    assert "comvla_model_errors_total 0.0" in metrics
+    assert len(httpx.get(f"{server.admin_url}/v1/sessions").json()["sessions"]) > 0
+
+
+def test_random_bytes_to_the_ports_do_no_harm(server: BackgroundServer, robot: Robot) -> None:
+    """Not even HTTP/2 on the one port, not even HTTP on the other."""
+    rng = random.Random(7)
+    for port in (server.server.port, server.server.admin_port):
+        for _ in range(20):
+            with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as connection:
+                connection.sendall(rng.randbytes(rng.randrange(1, 400)))
+    assert robot.infer(message())
+    assert httpx.get(f"{server.admin_url}/readyz").status_code == 200
+
+
+def test_mutated_requests_do_not_break_a_real_model() -> None:
+    """Whatever passes validation, a real forward pass turns into finite actions."""
+    _, cloud = random_policy(seed=0)
+    known = ("pull the green drawer open", "press the yellow button firmly")
+    with BackgroundServer(Engine(cloud)) as server:
+        statuses, _ = asyncio.run(
+            attack(server.target, seed=21, requests=1000, info=cloud.info, instructions=known)
+        )
+    assert set(statuses) <= EXPECTED, statuses
+    assert statuses[grpc.StatusCode.OK] > 20
