@@ -75,7 +75,6 @@ def run(args: argparse.Namespace) -> int:
     from comvla import codec
     from comvla_sim.experiments import plan, runner
     from comvla_sim.experiments.results import ResultsFile
-    from comvla_sim.experiments.selectors import METHODS
     from comvla_sim.experiments.summary import summarise
 
     if args.workers < 0:
@@ -100,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         tasks=_chosen_tasks(args.instructions, subject.tasks),
         episodes=args.episodes,
     )
-    grid.check(num_tokens=subject.num_tokens, methods=tuple(METHODS), seed=args.seed)
+    grid.check(num_tokens=subject.num_tokens, seed=args.seed)
     specs = list(grid.specs(subject.num_tokens))
     path = args.out or _default_path(settings, subject)
     with ResultsFile(path, subject.settings) as results:

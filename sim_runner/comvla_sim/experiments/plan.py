@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout
+from comvla_sim.experiments.selectors import METHODS
 
 CONDITIONS = ("normal", "blind", "wrong_instruction", "wrong_selection")
 """How an episode is run: as it should be, or with one thing wrong (:mod:`.rollout`)."""
@@ -72,19 +73,18 @@ class Grid:
     tasks: tuple[str, ...]
     episodes: int
 
-    def check(self, *, num_tokens: int, methods: Sequence[str], seed: int) -> None:
+    def check(self, *, num_tokens: int, seed: int) -> None:
         """Refuses a grid that cannot be run.
 
         Args:
             num_tokens: N of the model.
-            methods: names of all selectors there are.
             seed: of the evaluation.
 
         Raises:
             EvaluationError: names what is wrong.
         """
         _known("--condition", self.conditions, CONDITIONS)
-        _known("--method", self.methods, methods)
+        _known("--method", self.methods, tuple(METHODS))
         if self.episodes < 1:
             raise EvaluationError(f"--episodes must be at least 1, got {self.episodes}")
         for episode in (0, self.episodes - 1):
@@ -94,17 +94,18 @@ class Grid:
         for k in self.ks:
             if not 1 <= k <= num_tokens:
                 raise EvaluationError(f"--k must be from 1 to the model's {num_tokens}, got {k}")
-        if FULL in self.methods and "wrong_selection" in self.conditions and len(self.methods) == 1:
+        if not any(True for _ in self.specs(num_tokens)):
             raise EvaluationError(
-                "--condition wrong_selection needs a method that selects: add hard_voting to --method"
+                "--condition wrong_selection needs a method that listens when it selects: add "
+                "hard_voting to --method"
             )
 
     def specs(self, num_tokens: int) -> Iterator[EpisodeSpec]:
-        """All episodes, task by task, so that one layout after another is compared completely."""
+        """All episodes, layout by layout, so that whatever is there already can be compared."""
         for episode, task in itertools.product(range(self.episodes), self.tasks):
             for condition, method in itertools.product(self.conditions, self.methods):
-                if method == FULL and condition == "wrong_selection":
-                    continue  # nothing is selected, so nothing can be selected wrongly
+                if condition == "wrong_selection" and not METHODS[method].uses_language:
+                    continue  # what does not listen cannot be misled
                 for k in (num_tokens,) if method == FULL else self.ks:
                     yield EpisodeSpec(condition, method, k, task, episode)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -10,7 +11,11 @@ from typing import Any
 
 from comvla_sim.experiments.plan import CONDITIONS, FULL
 from comvla_sim.experiments.results import Row
+from comvla_sim.experiments.selectors import METHODS
 from comvla_sim.experiments.statistics import mcnemar, wilson_interval
+
+# What is compared with comes first, then the product, then controls.
+_METHOD_ORDER = (FULL, *(method for method in METHODS if method != FULL))
 
 Entry = tuple[str, str, int]
 """Condition, method, K."""
@@ -42,9 +47,9 @@ def summarise(rows: Iterable[Row]) -> dict[str, Any]:
     }
 
 
-def _order(entry: Entry) -> tuple[int, bool, str, int]:
+def _order(entry: Entry) -> tuple[int, int, int]:
     condition, method, k = entry
-    return CONDITIONS.index(condition), method != FULL, method, -k
+    return CONDITIONS.index(condition), _METHOD_ORDER.index(method), -k
 
 
 def _comparable(first: Entry, second: Entry) -> bool:
@@ -96,11 +101,11 @@ def _aggregate(entry: Entry, rows: Sequence[Row]) -> dict[str, Any]:
     counts = _counts(rows)
     per_task = _by_instruction(entry, rows)
     worst = min(per_task, key=lambda line: line["successes"] / line["episodes"])
-    queries = sum(row["queries"] for row in rows)
+    queries = int(sum(row["queries"] for row in rows))
     solved = [row["steps"] for row in rows if row["success"]]
 
     def per_query(key: str) -> float:
-        return round(float(sum(row[key] for row in rows)) / queries, 1)
+        return round(math.fsum(row[key] for row in rows) / queries, 1)
 
     return {
         **_named(entry),
@@ -149,11 +154,16 @@ def _sum_by_view(counts: Sequence[Sequence[int]]) -> list[int]:
 def _compare(
     first: Entry, second: Entry, first_rows: Sequence[Row], second_rows: Sequence[Row]
 ) -> dict[str, Any]:
-    outcomes = {(row["task"], row["episode"]): bool(row["success"]) for row in second_rows}
+    outcomes = {_episode(row): bool(row["success"]) for row in second_rows}
     pairs = [
-        (bool(row["success"]), outcomes[row["task"], row["episode"]])
+        (bool(row["success"]), outcomes[_episode(row)])
         for row in first_rows
-        if (row["task"], row["episode"]) in outcomes
+        if _episode(row) in outcomes
     ]
     test = mcnemar([a for a, _ in pairs], [b for _, b in pairs])
     return {"first": _named(first), "second": _named(second), **asdict(test)}
+
+
+def _episode(row: Row) -> tuple[int, str]:
+    """What makes two episodes a pair: the layout, which holds seed and number, and the task."""
+    return row["layout_seed"], row["task"]

@@ -41,14 +41,14 @@ def print_summary(summary: dict[str, Any], console: Console | None = None) -> No
 def _table(title: str, *names: str) -> Table:
     table = Table(title=title, title_justify="left")
     for name in names:
-        table.add_column(name, no_wrap=True)
+        table.add_column(name)
     return table
 
 
 def _aggregate(lines: list[dict[str, Any]]) -> Table:
     table = _table("Success over all instructions (95 % Wilson intervals)", "method, K")
     for name in ("success", "%", "interval", "other %", "bytes/query", "votes", "hit %"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     for line in lines:
         other, selection = line["other"], line["selection"]
         votes = selection["distinct_votes"]
@@ -83,7 +83,7 @@ def _by_task(lines: list[dict[str, Any]]) -> Table:
 def _comparisons(lines: list[dict[str, Any]]) -> Table:
     table = _table("Paired episodes, exact McNemar test", "first", "second")
     for name in ("pairs", "only first", "only second", "p"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     for line in sorted(lines, key=lambda line: float(line["p_value"]))[:_MAX_COMPARISONS]:
         names = (entry_name(line["first"]), entry_name(line["second"]))
         counts = (str(line[key]) for key in ("pairs", "only_first", "only_second"))

@@ -1,0 +1,1 @@
+"""The demo: four instructions over a fading link, and a film of each."""

@@ -1,0 +1,277 @@
+"""``comvla-sim demo``: four instructions over a fading link, and one page that shows it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from comvla_sim.experiments.errors import EvaluationError
+
+if TYPE_CHECKING:
+    from comvla_client.edge import EdgeModel
+    from comvla_sim.demo.episode import Episode
+    from comvla_sim.demo.scenario import Scene
+    from comvla_sim.demo.server_process import ServerProcess
+    from comvla_sim.worlds.base import World
+
+    Show: TypeAlias = Callable[[str, Scene], Callable[[Episode], None]]
+
+DESCRIPTION = """\
+Starts a policy server as a process of its own and lets a simulated arm obey instructions about
+different fixtures, its tokens crossing a simulated Rician link that withholds whatever exceeds the
+capacity of a control period. Each episode is repeated with every token on a link without limit.
+What happened is left as one HTML file that loads nothing.
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Registers the subcommand."""
+    parser = subparsers.add_parser(
+        "demo",
+        help="watch a robot obey over a rate-limited link",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/demo/demo.html"), help="(runs/demo/demo.html)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of tables and fading (0)")
+    parser.add_argument("--mean-snr-db", type=float, default=10.0, help="of the link, dB (10)")
+    parser.add_argument("--episodes", type=int, default=4, help="instructions to obey (4)")
+    parser.add_argument("--model", default="mini", help="mini or a checkpoint folder (mini)")
+    parser.add_argument("--open", action="store_true", help="show the page in a browser")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the demo. Returns 0 when it ran, however the robot did; 1 when the server failed."""
+    from comvla_sim.demo.server_process import ServerProcess, ServerProcessError
+
+    started = time.monotonic()
+    _claim(args.out)
+    with _terminated_like_interrupted():
+        try:
+            with ServerProcess(args.model) as server:
+                outcome = _play(args, server)
+        except ServerProcessError as error:
+            print(f"comvla-sim demo: {error}", file=sys.stderr)
+            return 1
+    outcome["wall_s"] = round(time.monotonic() - started, 1)
+    if args.json:
+        print(json.dumps(outcome))
+    else:
+        print(
+            f"{outcome['successes']} of {outcome['episodes']} episodes succeeded; "
+            f"{outcome['link']['above_capacity']} of {outcome['link']['requests']} requests above "
+            f"the link's capacity; {outcome['wall_s']:.0f} s\n{outcome['page']}"
+        )
+    if args.open:
+        import webbrowser
+
+        webbrowser.open(args.out.resolve().as_uri())
+    return 0
+
+
+def _claim(out: Path) -> None:
+    """Fails now, not after the episodes, where the page cannot be written."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with out.open("a", encoding="utf-8"):
+            pass
+    except OSError as error:
+        raise EvaluationError(f"cannot write {out}: {error.strerror}: choose --out") from error
+
+
+@contextlib.contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """SIGTERM unwinds the stack, so that the server is ended with the demo."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    try:
+        before = signal.signal(signal.SIGTERM, leave)
+    except ValueError:  # not the main thread, where signals are none of our business
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _play(args: argparse.Namespace, server: ServerProcess) -> dict[str, Any]:
+    """Both rounds of episodes, the page, and what the command reports."""
+    import torch
+
+    from comvla_sim import worlds
+    from comvla_sim.demo import figures
+    from comvla_sim.demo.page import render
+    from comvla_sim.demo.scenario import LINK, scenes
+    from comvla_sim.experiments.policy import load_edge_half
+
+    torch.set_num_threads(1)  # small pictures: more threads only wait for each other
+    edge = load_edge_half(args.model)
+    world = worlds.make("tabletop", image_size=edge.info.image_size[0])
+    try:
+        program = scenes(world.tasks, seed=args.seed, episodes=args.episodes)
+        with _progress(world.max_episode_steps) as show:
+            limited = [
+                _over_link(server, world, edge, scene, args.mean_snr_db, show) for scene in program
+            ]
+            unlimited = [_without_limit(server, world, edge, scene, show) for scene in program]
+    finally:
+        world.close()
+    use = figures.link_use(limited)
+    full = figures.figures_of(unlimited, _full_air_s(limited, unlimited, args.mean_snr_db))
+    ours = figures.figures_of(limited)
+    command = _command(args)
+    args.out.write_text(
+        render(
+            limited,
+            ours,
+            full,
+            use,
+            info=edge.info,
+            link=LINK,
+            mean_snr_db=args.mean_snr_db,
+            seed=args.seed,
+            command=command,
+        ),
+        encoding="utf-8",
+    )
+    return {
+        "page": str(args.out),
+        "command": command,
+        "episodes": len(limited),
+        "successes": ours.successes,
+        "link": {**asdict(LINK), "mean_snr_db": args.mean_snr_db, **asdict(use)},
+        "voted": asdict(ours),
+        "full": asdict(full),
+        "rows": [
+            _row(episode, reference) for episode, reference in zip(limited, unlimited, strict=True)
+        ],
+    }
+
+
+def _over_link(
+    server: ServerProcess,
+    world: World,
+    edge: EdgeModel,
+    scene: Scene,
+    mean_snr_db: float,
+    show: Show,
+) -> Episode:
+    from comvla_client import ComVLAClient
+    from comvla_client.transport import GrpcTransport
+    from comvla_sim.demo.episode import run_episode
+    from comvla_sim.demo.film import FilmCamera
+    from comvla_sim.demo.scenario import LINK, MIN_TOKENS
+    from comvla_sim.link import EnforcedLink
+
+    server.require_running()
+    link = EnforcedLink(GrpcTransport(server.target), scene.channel(mean_snr_db), LINK)
+    client = ComVLAClient(
+        link, edge=edge, link=LINK, budget="framed", min_tokens=MIN_TOKENS, seed=scene.number
+    )
+    camera = FilmCamera(world)
+    with client, contextlib.closing(camera):
+        episode = run_episode(
+            world, client, scene, link=link, camera=camera, on_period=show("voted tokens", scene)
+        )
+    server.require_running()
+    return episode
+
+
+def _without_limit(
+    server: ServerProcess,
+    world: World,
+    edge: EdgeModel,
+    scene: Scene,
+    show: Show,
+) -> Episode:
+    from comvla_client import ComVLAClient
+    from comvla_sim.demo.episode import run_episode
+
+    server.require_running()
+    with ComVLAClient(server.target, edge=edge, selector="full", seed=scene.number) as client:
+        episode = run_episode(world, client, scene, on_period=show("all tokens", scene))
+    server.require_running()
+    return episode
+
+
+def _full_air_s(
+    limited: list[Episode], unlimited: list[Episode], mean_snr_db: float
+) -> Iterator[float]:
+    """How long a request with all tokens would be on the air, from every period we sent in."""
+    from comvla_sim.demo.figures import air_time_s
+    from comvla_sim.demo.scenario import LINK
+
+    for episode, reference in zip(limited, unlimited, strict=True):
+        full_bits = 8 * max(query.report.framed_bytes for query in reference.queries)
+        for query in episode.queries:
+            rest = itertools.islice(episode.scene.channel(mean_snr_db), query.period, None)
+            yield air_time_s(full_bits, map(LINK.capacity_bits, rest), LINK.period_s)
+
+
+def _row(episode: Episode, reference: Episode) -> dict[str, Any]:
+    """One instruction in the command's JSON."""
+    return {
+        "task": episode.scene.task.name,
+        "instruction": episode.scene.task.instruction,
+        "layout_seed": episode.scene.layout_seed,
+        "success": episode.success,
+        "periods": episode.periods,
+        "success_with_all_tokens": reference.success,
+        "periods_with_all_tokens": reference.periods,
+        "log": [query.record.to_dict() for query in episode.queries if query.record],
+    }
+
+
+def _command(args: argparse.Namespace) -> str:
+    command = f"comvla-sim demo --seed {args.seed} --mean-snr-db {args.mean_snr_db:g}"
+    return f"{command} --episodes {args.episodes} --model {Path(args.model).name}"
+
+
+@contextlib.contextmanager
+def _progress(periods: int) -> Iterator[Show]:
+    """A bar for each episode on stderr, with what the link is doing."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+
+        def begin(way: str, scene: Scene) -> Callable[[Episode], None]:
+            bar = progress.add_task(f"{way}: {scene.task.instruction}", total=periods, note="")
+
+            def show(episode: Episode) -> None:
+                note = f"{len(episode.queries)} queries"
+                if episode.queries:
+                    note += f", {episode.queries[-1].report.tokens} tokens"
+                if episode.snr_db:
+                    note += f", {episode.snr_db[-1]:.0f} dB"
+                if episode.success:
+                    note += ", done"
+                total = episode.periods if episode.success else periods
+                progress.update(bar, completed=episode.periods, total=total, note=note)
+
+            return show
+
+        yield begin
