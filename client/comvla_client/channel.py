@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
 
 import grpc
 
@@ -54,23 +54,49 @@ def check_target(target: str) -> str:
     return target
 
 
-def retry_pauses_s() -> Iterator[float]:
-    """Seconds to wait before the second attempt, the third, and so on, inside one deadline."""
-    pause_s = 0.005
-    while True:
-        yield pause_s
-        pause_s = min(2 * pause_s, 0.05)
+class Attempts:
+    """The attempts of one call: when to try again, and which failure to tell in the end.
+
+    Only UNAVAILABLE is tried again, within the deadline, and only because the server answers a
+    repeated (session, step) from its record.
+
+    Args:
+        timeout_s: longest that all attempts together may take, in seconds.
+    """
+
+    FIRST_PAUSE_S = 0.005
+    LONGEST_PAUSE_S = 0.05
+
+    def __init__(self, timeout_s: float) -> None:
+        self._deadline = time.monotonic() + timeout_s
+        self._pause_s = self.FIRST_PAUSE_S
+        self._unavailable: TransportError | None = None
+
+    def remaining_s(self) -> float:
+        """Seconds left for the next attempt."""
+        return self._deadline - time.monotonic()
+
+    def pause_s(self, error: TransportError) -> float:
+        """Seconds to wait after a failed attempt before the next.
+
+        Raises:
+            TransportError: there is no next one, and this is why the call failed.
+        """
+        if error.code == "DEADLINE_EXCEEDED" and self._unavailable is not None:
+            # The clock only cut short the last of several attempts to reach a server that is gone.
+            raise self._unavailable
+        pause_s = self._pause_s
+        if error.code != "UNAVAILABLE" or _speaks_no_http2(error) or self.remaining_s() <= pause_s:
+            raise error
+        self._unavailable = error
+        self._pause_s = min(2 * pause_s, self.LONGEST_PAUSE_S)
+        return pause_s
 
 
 def transport_error(error: grpc.RpcError) -> TransportError:
     """A failed call in this package's words."""
     code, details = error.code(), error.details()
     return TransportError(code.name, details or "no details")
-
-
-def is_hopeless(error: TransportError) -> bool:
-    """Whether something answered at the address that will never be a ComVLA server."""
-    return error.code != "UNAVAILABLE" or "http1" in error.message.lower()
 
 
 def unanswered(timeout_s: float) -> TransportError:
@@ -81,15 +107,20 @@ def unanswered(timeout_s: float) -> TransportError:
 def no_server(target: str, error: TransportError, budget_s: float) -> HandshakeError:
     """Why a client could not be made, with host, budget and remedy."""
     if error.code == "UNIMPLEMENTED":
-        found = "a gRPC server answered that offers no comvla.v1.PolicyService"
-    elif "http1" in error.message.lower():
-        found = "an HTTP/1 server answered, which is not gRPC"
+        found = "a gRPC server answered that offers no comvla.v1.PolicyService."
+    elif _speaks_no_http2(error):
+        found = "what answered does not speak gRPC: a web server, or the admin surface?"
     elif error.code == "DEADLINE_EXCEEDED":
-        found = "nothing spoke gRPC in time"
+        found = "nothing spoke gRPC in time."
     else:
-        found = "no server was ready"
+        found = "no server was ready."
     return HandshakeError(
         f"expected a ComVLA server at {target} within {budget_s:g} s, but {found} "
-        f"({error.code}: {error.message}). Start one there with `comvla-server serve`, correct the "
-        "address, or allow more with connect_timeout_s; `comvla doctor` looks closer"
+        "Start one there with `comvla-server serve`, correct the address, or allow more with "
+        f"connect_timeout_s; `comvla doctor` looks closer ({error.code}: {error.message})"
     )
+
+
+def _speaks_no_http2(error: TransportError) -> bool:
+    # What answered will not turn into a gRPC server by waiting.
+    return "parsing HTTP/2" in error.message

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from typing import Any, Protocol
 
 import grpc
@@ -44,9 +43,8 @@ class Transport(Protocol):
 class GrpcTransport:
     """Calls over gRPC. Every call has a deadline that a clock on this machine enforces as well.
 
-    Only UNAVAILABLE is tried again, within the deadline, and only because the server answers a
-    repeated (session, step) from its record. An attempt after a failure takes a new connection, so
-    the first call after a server's return finds it.
+    UNAVAILABLE is tried again within the deadline (:class:`comvla_client.channel.Attempts`), each
+    time over a new connection, so the first call after a server's return finds it.
 
     Args:
         target: ``host:port``.
@@ -90,18 +88,14 @@ class GrpcTransport:
             self._channel.close()
 
     def _call(self, method: str, request: Any, timeout_s: float) -> Any:
-        deadline = time.monotonic() + timeout_s
+        attempts = channel.Attempts(timeout_s)
         if self._unanswered >= channel.FRESH_CHANNEL_AFTER:
             self._renew()
-        pauses_s = channel.retry_pauses_s()
         while True:
             try:
-                answer = self._attempt(method, request, deadline - time.monotonic())
+                answer = self._attempt(method, request, attempts.remaining_s())
             except TransportError as error:
-                pause_s = next(pauses_s)
-                if channel.is_hopeless(error) or deadline - time.monotonic() <= pause_s:
-                    raise
-                if self._closed.wait(pause_s):
+                if self._closed.wait(attempts.pause_s(error)):
                     raise self._closed_error() from error
                 self._renew()
             else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from typing import Any, Protocol
 
 import grpc
@@ -75,18 +74,14 @@ class GrpcAioTransport:
         await self._drop_channel()
 
     async def _call(self, method: str, request: Any, timeout_s: float) -> Any:
-        deadline = time.monotonic() + timeout_s
+        attempts = channel.Attempts(timeout_s)
         if self._unanswered >= channel.FRESH_CHANNEL_AFTER:
             await self._drop_channel()
-        pauses_s = channel.retry_pauses_s()
         while True:
             try:
-                answer = await self._attempt(method, request, deadline - time.monotonic())
+                answer = await self._attempt(method, request, attempts.remaining_s())
             except TransportError as error:
-                pause_s = next(pauses_s)
-                if channel.is_hopeless(error) or deadline - time.monotonic() <= pause_s:
-                    raise
-                await asyncio.sleep(pause_s)
+                await asyncio.sleep(attempts.pause_s(error))
                 await self._drop_channel()
             else:
                 self._unanswered = 0
