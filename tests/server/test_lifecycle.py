@@ -170,9 +170,7 @@ def test_a_taken_port_is_named_and_nothing_is_half_started(cloud: StubCloud, opt
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         server = BackgroundServer(Engine(cloud), ServerSettings(**{option: port}))
-        with pytest.raises(
-            BindError, match=rf"cannot listen on 127\.0\.0\.1:{port}.*0 takes a free"
-        ):
+        with pytest.raises(BindError, match=rf"cannot listen on 127\.0\.0\.1:{port}.*0 takes"):
             server.start()
     assert cloud.batches == []
     # Whatever the failed start had taken is free again.
@@ -187,7 +185,7 @@ def test_two_servers_never_share_a_port(cloud: StubCloud) -> None:
 
 
 def test_an_address_of_another_machine_is_refused(cloud: StubCloud) -> None:
-    with pytest.raises(BindError, match="192.0.2.1"):
+    with pytest.raises(BindError, match=r"192\.0\.2\.1"):
         BackgroundServer(Engine(cloud), ServerSettings(host="192.0.2.1")).start()
 
 
