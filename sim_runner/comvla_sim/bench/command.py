@@ -1,0 +1,103 @@
+"""``comvla-sim bench transport | edge | batching``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Registers ``bench`` and its three benchmarks."""
+    parser = subparsers.add_parser(
+        "bench",
+        help="measure transport, edge computations and batching against their limits",
+        description="Each benchmark measures its own limit in the same run and reports ratios.",
+    )
+    benches = parser.add_subparsers(dest="bench", required=True, metavar="BENCH")
+    for name, (text, add_options) in _BENCHES.items():
+        bench = benches.add_parser(name, help=text, description=text)
+        bench.add_argument("--json", action="store_true", help="print one JSON object")
+        bench.add_argument(
+            "--repetitions", type=_at_least(1), help="timed calls (default: the bench's own)"
+        )
+        bench.add_argument(
+            "--warm-up", type=_at_least(0), help="calls before them (default: the bench's own)"
+        )
+        add_options(bench)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs one benchmark and prints its table, or JSON with ``--json``."""
+    result = {"transport": _transport, "edge": _edge, "batching": _batching}[args.bench](args)
+    print(json.dumps(result, indent=2) if args.json else _text(result))
+    return 0
+
+
+def _transport_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--k", dest="token_budget", type=_at_least(1), help="tokens (32)")
+
+
+def _edge_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--k", dest="token_budget", type=_at_least(1), help="tokens (32)")
+    parser.add_argument("--threads", type=_at_least(1), help="of the numerical libraries (1)")
+
+
+def _batching_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--clients", type=_at_least(1), help="robots (16)")
+    parser.add_argument("--max-batch", type=_at_least(2), help="of the batching server (8)")
+    parser.add_argument("--model", help="mini, random or a checkpoint (mini)")
+    parser.add_argument("--threads", type=_at_least(0), help="of torch in the server (1)")
+
+
+_BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
+    "transport": ("68 KiB up, 1 KiB down, against raw TCP and a websocket", _transport_options),
+    "edge": ("vote, select, quantise, pack, against a matrix product", _edge_options),
+    "batching": ("many robots on one server, against batches of one", _batching_options),
+}
+
+
+def _transport(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.bench import transport
+
+    return transport.run(_given(transport.TransportParameters, args))
+
+
+def _edge(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.bench import edge
+
+    return edge.run(_given(edge.EdgeParameters, args))
+
+
+def _batching(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.bench import batching
+
+    return batching.run(_given(batching.BatchingParameters, args))
+
+
+def _given(parameters: Callable[..., Any], args: argparse.Namespace) -> Any:
+    """The parameters with what the command line named, and defaults for the rest."""
+    names = {field.name for field in dataclasses.fields(parameters)}  # type: ignore[arg-type]
+    return parameters(**{k: v for k, v in vars(args).items() if k in names and v is not None})
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"expected a whole number >= {least}, got {text!r}")
+        return value
+
+    return parse
+
+
+def _text(result: dict[str, Any]) -> str:
+    from comvla_sim.bench.report import describe
+
+    return describe(result)
