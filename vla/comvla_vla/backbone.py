@@ -17,6 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from comvla_vla.config import BackboneConfig
+from comvla_vla.fastv import last_row_attention, surviving_rows
+from comvla_vla.options import FastV
 
 
 class RMSNorm(nn.Module):
@@ -63,6 +65,13 @@ class SelfAttention(nn.Module):
         self.config = config
         self.qkv_proj = nn.Linear(config.hidden, 3 * config.hidden, bias=False)
         self.o_proj = nn.Linear(config.hidden, config.hidden, bias=False)
+
+    def queries_and_keys(self, x: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotated queries and keys, each (R, heads, head_dim), of normalised rows (R, d)."""
+        weight = self.qkv_proj.weight[: 2 * self.config.hidden]
+        both = F.linear(x, weight).view(-1, 2, self.config.heads, self.config.head_dim)
+        q, k = both.unbind(1)
+        return rotate(q, cos, sin), rotate(k, cos, sin)
 
     def forward(self, x: Tensor, cos: Tensor, sin: Tensor, lengths: Sequence[int]) -> Tensor:
         """Rows (R, d) of sequences with ``lengths`` (summing to R) to (R, d)."""
@@ -123,19 +132,37 @@ class Backbone(nn.Module):
         self.layers = nn.ModuleList(Layer(config) for _ in range(config.layers))
         self.norm = RMSNorm(config.hidden, config.rms_eps)
 
-    def forward(self, rows: Tensor, positions: Tensor, lengths: Sequence[int]) -> Tensor:
+    def forward(
+        self,
+        rows: Tensor,
+        positions: Tensor,
+        lengths: Sequence[int],
+        visual: Sequence[int] = (),
+        fastv: FastV | None = None,
+    ) -> tuple[Tensor, list[int]]:
         """Final hidden states after the last norm.
 
         Args:
             rows: (R, d) input embeddings, sequences end to end.
             positions: (R,) rotary positions in the unpruned sequence.
             lengths: rows of each sequence; they sum to R.
+            visual: visual tokens of each sequence, right behind its first row; for ``fastv`` only.
+            fastv: drops visual tokens on the way.
 
         Returns:
-            (R, d) hidden states.
+            (R', d) hidden states and the length of each sequence, R' = R and ``lengths`` without ``fastv``.
         """
         cos, sin = rotary_tables(positions, self.config, rows.dtype)
-        for layer in self.layers:
+        lengths = list(lengths)
+        before = rows
+        for index, layer in enumerate(self.layers):
+            if fastv is not None and index == fastv.layer:
+                ranking = self.layers[index - 1]
+                assert isinstance(ranking, Layer)
+                seen = last_row_attention(ranking, before, cos, sin, lengths)
+                kept, lengths = surviving_rows(seen, visual, fastv)
+                rows, cos, sin = rows[kept], cos[kept], sin[kept]
+            before = rows
             rows = layer(rows, cos, sin, lengths)
         out: Tensor = self.norm(rows)
-        return out
+        return out, lengths

@@ -14,6 +14,7 @@ from torch import Tensor
 from comvla_vla.config import ModelConfig
 from comvla_vla.flops import cloud_flops
 from comvla_vla.nets import CloudNet
+from comvla_vla.options import CloudOptions
 from comvla_vla.prompt import Prompt
 from comvla_vla.request import PolicyRequest
 from comvla_vla.statistics import Statistics
@@ -25,18 +26,27 @@ class CloudModel:
     Attributes:
         config: sizes. info: what the handshake compares. net: the torch module, in evaluation mode.
         statistics: how proprioception is normalised and actions un-normalised.
+        options: how it is run.
     """
 
     def __init__(
-        self, net: CloudNet, prompt: Prompt, statistics: Statistics, info: ModelInfo
+        self,
+        net: CloudNet,
+        prompt: Prompt,
+        statistics: Statistics,
+        info: ModelInfo,
+        options: CloudOptions | None = None,
     ) -> None:
         self.net = net.eval()
         self.config: ModelConfig = net.config
         self.info = info
         self.prompt = prompt
         self.statistics = statistics
+        self.options = options if options is not None else CloudOptions()
         parameter = next(net.parameters())
         self.device, self.dtype = parameter.device, parameter.dtype
+        if self.options.compile:
+            net.backbone.compile(dynamic=True)
 
     def check_instruction(self, instruction: str) -> None:
         """Raises InstructionError where :meth:`predict` would."""
@@ -65,12 +75,25 @@ class CloudModel:
         sizes = [len(t) for t in tokens]
         projected = self.net.projector(torch.cat(tokens), torch.cat(positions)).split(sizes)
         prompts = [torch.tensor(self._ids(r.instruction), device=self.device) for r in requests]
-        actions, _ = self.net(projected, positions, prompts, self._proprio(requests))
+        proprio = self._proprio(requests)
+        if self.config.action.head == "diffusion":
+            noise = self._noise().expand(len(requests), -1, -1)
+            actions = self.net.denoise(projected, positions, prompts, proprio, noise, self.options)
+        else:
+            actions, _ = self.net(projected, positions, prompts, proprio, self.options)
         return list(self.statistics.unnormalise_actions(actions.float().cpu().numpy()))
 
     def flops(self, num_tokens: int, instruction: str | Sequence[int]) -> int:
         """Operations of one request with ``num_tokens`` visual tokens."""
-        return cloud_flops(self.config, num_tokens, len(self._ids(instruction)))
+        prompt_tokens = len(self._ids(instruction))
+        return cloud_flops(self.config, num_tokens, prompt_tokens, self.options.fastv)
+
+    def _noise(self) -> Tensor:
+        """Where denoising starts (1, H, A): the same for every request, so that a retry gets the same answer."""
+        action = self.config.action
+        generator = torch.Generator().manual_seed(self.options.noise_seed)
+        shape = (1, action.horizon, action.action_dim)
+        return torch.randn(shape, generator=generator).to(self.device)
 
     def _ids(self, instruction: str | Sequence[int]) -> Sequence[int]:
         return self.prompt.ids(instruction) if isinstance(instruction, str) else list(instruction)

@@ -27,6 +27,7 @@ class TowerConfig:
         layer_scale: whether each residual branch carries a learned scale (DINOv2).
         norm_eps: epsilon of the LayerNorms.
         stem_dim, kernels: widths of the first stage and depthwise kernels of the second one (conv).
+        film_dim: width of the language vector that scales and shifts every block (FiLM), 0 for none.
     """
 
     kind: Literal["vit", "conv"]
@@ -44,6 +45,7 @@ class TowerConfig:
     norm_eps: float = 1e-6
     stem_dim: int = 0
     kernels: tuple[int, ...] = ()
+    film_dim: int = 0
 
     @property
     def side(self) -> int:
@@ -98,7 +100,10 @@ class ActionConfig:
         head_hidden: width inside the head (OpenVLA-OFT: the backbone's). head_blocks: residual blocks.
         learned_placeholders: trained vectors instead of the zeros of the published layout.
         first_slot: offset of the hidden states that the head reads, relative to the first action placeholder.
-            OpenVLA-OFT reads from one position before it (-1).
+            OpenVLA-OFT is trained and run from one position before it (-1), VLA-ADP runs from it (0), LightVLA's
+            published inference from one after it (1).
+        head: ``"l1"`` regresses the chunk in one pass, ``"diffusion"`` denoises it (DDIM).
+        diffusion_train_steps, diffusion_steps: noise levels in training, and passes at inference.
     """
 
     horizon: int
@@ -108,6 +113,9 @@ class ActionConfig:
     head_blocks: int = 2
     learned_placeholders: bool = False
     first_slot: int = -1
+    head: Literal["l1", "diffusion"] = "l1"
+    diffusion_train_steps: int = 50
+    diffusion_steps: int = 50
 
     @property
     def slots(self) -> int:
@@ -140,7 +148,13 @@ class PromptConfig:
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything that fixes the shapes and the arithmetic of one policy."""
+    """Everything that fixes the shapes and the arithmetic of one policy.
+
+    Attributes:
+        preprocess: ``"exact"`` takes pictures of the towers' size as they are, ``"openvla"`` repeats what
+            OpenVLA-OFT's evaluation does to camera pictures of any size.
+        edge_pruners: other pruners whose weights the edge half carries: ``"lightvla"``, ``"vla_adp"``.
+    """
 
     name: str
     views: int
@@ -151,6 +165,7 @@ class ModelConfig:
     prompt: PromptConfig
     preprocess: Literal["exact", "openvla"] = "exact"
     control_period_s: float = 0.05
+    edge_pruners: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.towers:
@@ -166,6 +181,8 @@ class ModelConfig:
             raise CheckpointError(
                 f"backbone width {self.backbone.hidden} does not split into {self.backbone.heads} heads of even width"
             )
+        if unknown := set(self.edge_pruners) - {"lightvla", "vla_adp"}:
+            raise CheckpointError(f"no such edge pruners: {sorted(unknown)}")
         if self.projector.positions == "sine2d" and self.backbone.hidden % 4:
             raise CheckpointError(
                 f"2-D sine positions need a width divisible by 4, got {self.backbone.hidden}"
@@ -177,6 +194,11 @@ class ModelConfig:
             raise CheckpointError(
                 f"the longest sequence exceeds the backbone's {self.backbone.max_positions} positions"
             )
+
+    @property
+    def film(self) -> bool:
+        """Whether the towers see the instruction."""
+        return any(t.film_dim for t in self.towers)
 
     @property
     def token_dim(self) -> int:
@@ -217,6 +239,7 @@ class ModelConfig:
                 prompt=_build(PromptConfig, data["prompt"]),
                 preprocess=data.get("preprocess", "exact"),
                 control_period_s=float(data.get("control_period_s", 0.05)),
+                edge_pruners=tuple(data.get("edge_pruners", ())),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(

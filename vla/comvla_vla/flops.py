@@ -7,6 +7,7 @@ count every matrix product of a half as it is really run.
 from __future__ import annotations
 
 from comvla_vla.config import BackboneConfig, ModelConfig, TowerConfig
+from comvla_vla.options import FastV
 
 
 def layer_flops(s: int, d: int, f: int) -> int:
@@ -21,7 +22,8 @@ def backbone_flops(config: BackboneConfig, sequence_length: int) -> int:
 
 def non_visual_tokens(config: ModelConfig, prompt_tokens: int) -> int:
     """Tokens beside the visual ones: prompt (with BOS), proprioception, action placeholders, stop."""
-    return prompt_tokens + int(config.action.proprio_dim > 0) + config.action.slots + 1
+    level = config.action.head == "diffusion"  # the noise level is a token
+    return prompt_tokens + int(config.action.proprio_dim > 0) + int(level) + config.action.slots + 1
 
 
 def projector_flops(config: ModelConfig, tokens: int) -> int:
@@ -37,7 +39,8 @@ def tower_flops(tower: TowerConfig) -> int:
     patches, dim = tower.side**2, tower.dim
     if tower.kind == "vit":
         t = patches + tower.prefix_tokens
-        block = 8 * t * dim * dim + 4 * t * t * dim + 4 * t * dim * tower.mlp_dim
+        film = 4 * tower.film_dim * dim
+        block = film + 8 * t * dim * dim + 4 * t * t * dim + 4 * t * dim * tower.mlp_dim
         return 2 * patches * 3 * tower.patch_size**2 * dim + (tower.depth - 1) * block
     stride = tower.patch_size // 4
     cells = patches * stride**2
@@ -63,13 +66,26 @@ def edge_flops(config: ModelConfig, num_queries: int) -> int:
     return vision_flops(config) + projector_flops(config, tokens) + scoring
 
 
-def cloud_flops(config: ModelConfig, visual_tokens: int, prompt_tokens: int) -> int:
-    """The cloud's share of one request: projector, backbone, proprioception and action head."""
-    action, hidden = config.action, config.backbone.hidden
-    length = visual_tokens + non_visual_tokens(config, prompt_tokens)
+def cloud_flops(
+    config: ModelConfig, visual_tokens: int, prompt_tokens: int, fastv: FastV | None = None
+) -> int:
+    """The cloud's share of one request: projector, backbone, proprioception and action head.
+
+    A diffusion head runs backbone and head once for every noise level; FastV runs the later layers on fewer tokens.
+    """
+    action, hidden, backbone = config.action, config.backbone.hidden, config.backbone
+    others = non_visual_tokens(config, prompt_tokens)
     head_in = hidden * action.action_dim
     head = head_in * action.head_hidden + action.head_blocks * action.head_hidden**2
     head += action.head_hidden * action.action_dim
     proprio = action.proprio_dim * hidden + hidden * hidden if action.proprio_dim else 0
-    total = backbone_flops(config.backbone, length) + projector_flops(config, visual_tokens)
-    return total + 2 * action.horizon * head + 2 * proprio
+    full = backbone.layers if fastv is None else min(fastv.layer, backbone.layers)
+    fewer = visual_tokens if fastv is None else fastv.kept(visual_tokens)
+    layers = full * layer_flops(visual_tokens + others, hidden, backbone.intermediate)
+    layers += (backbone.layers - full) * layer_flops(fewer + others, hidden, backbone.intermediate)
+    one_pass = layers + 2 * action.horizon * head
+    passes = 1
+    if action.head == "diffusion":
+        passes = action.diffusion_steps
+        one_pass += 2 * action.slots * (hidden + hidden * hidden)  # projecting the noisy actions
+    return passes * one_pass + projector_flops(config, visual_tokens) + 2 * proprio

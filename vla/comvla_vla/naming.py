@@ -18,8 +18,11 @@ _PREFIXES = (
     ("query_embed.", "language_model.query_embed."),
     ("placeholders", "language_model.action_placeholders"),
     ("action_head.", "action_head.model."),
+    ("noise_predictor.", "action_head.noise_predictor.mlp_resnet."),
+    ("probe.", "language_model.model.layers.0."),
 )
 _FUSED = {
+    "qk_proj": ("q_proj", "k_proj"),
     "qkv_proj": ("q_proj", "k_proj", "v_proj"),
     "gate_up_proj": ("gate_proj", "up_proj"),
 }

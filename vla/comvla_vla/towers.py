@@ -71,11 +71,38 @@ class Block(nn.Module):
         self.mlp = Mlp(dim, config.mlp_dim)
         self.ls2 = LayerScale(dim) if config.layer_scale else nn.Identity()
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, T, dim) to (B, T, dim)."""
-        x = x + self.ls1(self.attn(self.norm1(x)))
+    def attend(self, x: Tensor) -> Tensor:
+        """The first half: (B, T, dim) to (B, T, dim)."""
+        out: Tensor = x + self.ls1(self.attn(self.norm1(x)))
+        return out
+
+    def feed(self, x: Tensor) -> Tensor:
+        """The second half: (B, T, dim) to (B, T, dim)."""
         out: Tensor = x + self.ls2(self.mlp(self.norm2(x)))
         return out
+
+    def forward(self, x: Tensor, language: Tensor | None = None) -> Tensor:
+        """(B, T, dim) to (B, T, dim); ``language`` is for blocks that listen."""
+        return self.feed(self.attend(x))
+
+
+class FilmBlock(nn.Module):
+    """A block whose tokens the instruction scales and shifts between attention and feed-forward (FiLM).
+
+    Source: moojink/openvla-oft, ``film_vit_wrapper.py``. Prefix tokens are modulated too.
+    """
+
+    def __init__(self, config: TowerConfig) -> None:
+        super().__init__()
+        self.block = Block(config)
+        self.scale = nn.Linear(config.film_dim, config.dim)
+        self.shift = nn.Linear(config.film_dim, config.dim)
+
+    def forward(self, x: Tensor, language: Tensor | None = None) -> Tensor:
+        """(B, T, dim) and the mean text embedding (B, film_dim) to (B, T, dim)."""
+        assert language is not None, "a FiLM tower needs the instruction"
+        gain, offset = self.scale(language)[:, None], self.shift(language)[:, None]
+        return self.block.feed(self.block.attend(x) * (1 + gain) + offset)
 
 
 class PatchEmbed(nn.Module):
@@ -103,10 +130,11 @@ class ViTTower(nn.Module):
             self.cls_token = nn.Parameter(torch.zeros(1, 1, config.dim))
         if config.register_tokens:
             self.reg_token = nn.Parameter(torch.zeros(1, config.register_tokens, config.dim))
-        self.blocks = nn.ModuleList(Block(config) for _ in range(config.depth - 1))
+        block = FilmBlock if config.film_dim else Block
+        self.blocks = nn.ModuleList(block(config) for _ in range(config.depth - 1))
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        """(B, 3, S, S) normalised pixels to (B, rows * columns, dim)."""
+    def forward(self, pixels: Tensor, language: Tensor | None = None) -> Tensor:
+        """(B, 3, S, S) normalised pixels to (B, rows * columns, dim); ``language`` (B, film_dim) where FiLM is on."""
         x: Tensor = self.patch_embed(pixels) + self.pos_embed
         prefix = []
         if self.config.class_token:
@@ -115,7 +143,7 @@ class ViTTower(nn.Module):
             prefix.append(self.reg_token.expand(len(x), -1, -1))
         x = torch.cat([*prefix, x], dim=1)
         for block in self.blocks:
-            x = block(x)
+            x = block(x, language)
         return x[:, self.config.prefix_tokens :]
 
 
@@ -152,8 +180,8 @@ class ConvTower(nn.Module):
             ConvBlock(config.dim, k, config.norm_eps) for k in config.kernels
         )
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        """(B, 3, S, S) normalised pixels to (B, rows * columns, dim)."""
+    def forward(self, pixels: Tensor, language: Tensor | None = None) -> Tensor:
+        """(B, 3, S, S) normalised pixels to (B, rows * columns, dim); this tower does not listen."""
         x = pixels.contiguous(memory_format=torch.channels_last)
         x = self.down(self.stem_block(F.gelu(self.stem(x))))
         for block in self.blocks:

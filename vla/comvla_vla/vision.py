@@ -26,12 +26,16 @@ class VisionBackbone(nn.Module):
         if config.projector.positions == "sine2d":
             self.view_embed = nn.Parameter(torch.zeros(config.views, config.token_dim))
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        """Normalised pixels (B, views, 3 * towers, S, S), channels grouped by tower, to (B, N, D)."""
+    def forward(self, pixels: Tensor, language: Tensor | None = None) -> Tensor:
+        """Normalised pixels (B, views, 3 * towers, S, S), channels grouped by tower, to (B, N, D).
+
+        ``language`` is the mean text embedding (B, d) where towers listen to the instruction (FiLM).
+        """
         batch, views = pixels.shape[:2]
         flat = pixels.flatten(0, 1)
+        heard = None if language is None else language.repeat_interleave(views, 0)
         features = [
-            cast(Tensor, self.get_submodule(name)(flat[:, 3 * i : 3 * i + 3]))
+            cast(Tensor, self.get_submodule(name)(flat[:, 3 * i : 3 * i + 3], heard))
             for i, name in zip(range(len(self.config.towers)), TOWER_NAMES, strict=False)
         ]
         tokens: Tensor = torch.cat(features, dim=-1).view(batch, views, -1, self.config.token_dim)
@@ -62,6 +66,11 @@ class Projector(nn.Module):
             self.view_embed = nn.Parameter(torch.randn(config.views, hidden) * 0.5)
             # Derived from the configuration, so neither saved nor counted as a parameter.
             self.register_buffer("sines", sine_positions(config), persistent=False)
+
+    def derive(self) -> None:
+        """Computes anew what follows from the configuration, after parameters were given memory."""
+        if self.config.projector.positions == "sine2d":
+            self.sines = sine_positions(self.config).to(self.fc1.weight)
 
     def forward(self, tokens: Tensor, positions: Tensor | None = None) -> Tensor:
         """Projects tokens (..., K, D) at ``positions`` (..., K) (None: all N in order) to (..., K, d)."""
