@@ -97,6 +97,16 @@ def test_int4_uses_all_of_its_16_levels() -> None:
     np.testing.assert_allclose(np.unique(decoded), np.arange(-8, 8), atol=1e-5)
 
 
+def test_rounding_past_the_end_of_float32_comes_back_to_it() -> None:
+    """The scale that holds 3.4e38 puts level -8 beyond float32; so does a damaged scale."""
+    tokens = np.array([[3.4e38, -3.4e38, 1e38]], np.float32)
+    decoded, _ = codec.decode(codec.encode(tokens, [0], "int4"))
+    np.testing.assert_allclose(decoded.astype(float), tokens.astype(float), atol=3.4e38 / 14)
+    damaged = bytearray(codec.encode(tokens, [0], "int8"))
+    damaged[19] = 0x7F  # the scale's highest byte
+    assert np.abs(codec.decode(damaged)[0]).max() == np.finfo(np.float32).max
+
+
 def test_a_quiet_tower_keeps_its_resolution_beside_a_loud_one() -> None:
     loud_and_quiet = np.array([[1000, -500, 0.001, -0.002]], np.float32)
     split, _ = codec.decode(codec.encode(loud_and_quiet, [0], "int8", tower_dims=(2, 2)))

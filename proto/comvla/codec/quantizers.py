@@ -147,7 +147,7 @@ class Int8(Quantizer):
         work = np.abs(tokens)
         peaks = np.stack([work[:, tower].max(axis=1) for tower in towers], axis=1)
         _require_finite(peaks)  # a NaN or an infinity anywhere shows in its tower's peak
-        steps = _steps(peaks / np.float32(self._LEVELS), self._LEVELS)
+        steps = np.maximum(peaks / np.float32(self._LEVELS), _SMALLEST_SCALE)
         scales[...] = steps
         inverse = np.float32(1) / steps
         for index, tower in enumerate(towers):
@@ -166,8 +166,7 @@ class Int8(Quantizer):
         tokens = levels.astype(np.float32)
         for index, tower in enumerate(towers):
             tokens[:, tower] *= scales[:, index, None]
-        _require_finite(tokens)
-        return tokens
+        return _saturated(tokens)
 
 
 class Int4(Quantizer):
@@ -191,7 +190,7 @@ class Int4(Quantizer):
     ) -> None:
         ends = np.stack([tokens.max(axis=1) / 7, tokens.min(axis=1) / -8], axis=1)
         _require_finite(ends)  # a NaN or an infinity anywhere shows at one end
-        steps = _steps(ends.max(axis=1, keepdims=True), 7)
+        steps = np.maximum(ends.max(axis=1, keepdims=True), _SMALLEST_SCALE)
         scales[...] = steps
         count, token_dim = tokens.shape
         levels = np.zeros((count, 2 * values.shape[1]), np.int8)  # an odd D leaves a zero behind
@@ -215,8 +214,7 @@ class Int4(Quantizer):
         levels -= 8
         tokens = levels[:, :token_dim].astype(np.float32)
         tokens *= scales
-        _require_finite(tokens)
-        return tokens
+        return _saturated(tokens)
 
 
 _QUANTIZERS: dict[str, Quantizer] = {
@@ -275,17 +273,16 @@ def _require_finite(values: NDArray[Any]) -> None:
         )
 
 
-def _steps(wanted: FloatArray, levels: int) -> FloatArray:
-    """The scales wanted, within what both ``1 / scale`` and ``levels * scale`` can hold."""
-    largest = np.nextafter(_FLOAT32_MAX / np.float32(levels), np.float32(0))
-    return np.clip(wanted, _SMALLEST_SCALE, largest)
-
-
 def _require_scales(scales: FloatArray) -> None:
     sound = (scales >= _SMALLEST_SCALE) & (scales <= _FLOAT32_MAX)  # False for NaN, too
     if not sound.all():
         token = int(np.argwhere(~sound)[0][0])
         raise CodecError(
-            f"expected positive, finite scales, got {scales[token].tolist()} in token {token}: "
+            f"expected finite, positive scales, got {scales[token].tolist()} in token {token}: "
             "the payload is damaged"
         )
+
+
+def _saturated(tokens: FloatArray) -> FloatArray:
+    """Products that rounding carried past the end of float32 come back to it, in place."""
+    return np.clip(tokens, -_FLOAT32_MAX, _FLOAT32_MAX, out=tokens)
