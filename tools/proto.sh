@@ -1,11 +1,9 @@
 #!/usr/bin/env bash
-# Writes the Python code of proto/comvla/v1/policy.proto, with type stubs.
+# Regenerates the Python code of the contract with the pinned, old generator.
 #
-#   tools/proto.sh [FOLDER]   (default: proto, so that the generated code lies beside its source)
+#   tools/proto.sh [--out FOLDER]   (default: beside its source)
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-out=${1:-proto}
 tools/setup.sh proto
-"${VENV:-.venv}-proto/bin/python" -m grpc_tools.protoc --proto_path=proto \
-    --python_out="$out" --pyi_out="$out" --grpc_python_out="$out" comvla/v1/policy.proto
+.venv-proto/bin/python proto/generate.py "$@"

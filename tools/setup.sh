@@ -118,8 +118,9 @@ dev)
     need_prometheus
     ;;
 proto)
-    make_environment "$venv-proto"
-    install_into "$venv-proto" proto "$(state_of "$venv-proto" tools/proto-requirements.txt)" \
+    # Always here, because the test that regenerates the code looks for it here.
+    make_environment .venv-proto
+    install_into .venv-proto proto "$(state_of .venv-proto tools/proto-requirements.txt)" \
         --requirement tools/proto-requirements.txt
     ;;
 *) die "expected sim, dev or proto, got '$extra'" ;;

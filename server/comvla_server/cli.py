@@ -28,8 +28,8 @@ exit codes: 0 done, 1 calls were cut off or something broke, 2 a wrong option, m
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one subcommand and returns the exit code."""
+def build_parser() -> argparse.ArgumentParser:
+    """The parser with every subcommand."""
     parser = argparse.ArgumentParser(
         prog="comvla-server",
         description=_DESCRIPTION,
@@ -40,7 +40,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     serve_command.add_parser(subparsers)
     inspect_command.add_parser(subparsers)
-    args = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one subcommand and returns the exit code."""
+    args = build_parser().parse_args(argv)
     try:
         return int(args.run(args))
     except ComVLAError as error:
