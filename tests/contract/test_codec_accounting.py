@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from comvla import codec
@@ -43,6 +43,7 @@ def test_an_odd_number_of_half_bytes_is_rounded_up() -> None:
     assert codec.payload_bytes(2, 5, "int4") == 5
 
 
+@settings(deadline=None)
 @given(st.integers(0, 40), st.lists(st.integers(1, 30), min_size=1, max_size=16), quantizations)
 def test_encoded_bytes_is_the_length_of_what_encode_writes(
     k: int, towers: list[int], quantization: str
@@ -54,6 +55,7 @@ def test_encoded_bytes_is_the_length_of_what_encode_writes(
     assert len(payload) == codec.encoded_bytes(k, token_dim, quantization, num_towers=len(towers))
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2_000_000), st.integers(1, 4096), quantizations, st.integers(1, 16))
 def test_prefix_tokens_inverts_encoded_bytes(
     nbytes: int, token_dim: int, quantization: str, num_towers: int
@@ -68,6 +70,7 @@ def test_prefix_tokens_inverts_encoded_bytes(
 texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=200)
 
 
+@settings(deadline=None)
 @given(
     payload=st.integers(0, 40_000),
     session_id=texts,
@@ -139,6 +142,7 @@ def test_request_wire_bytes_composes_payload_message_and_frames() -> None:
     assert total == codec.wire_bytes(message) + codec.CALL_HEADERS_BYTES
 
 
+@settings(deadline=None)
 @given(st.integers(0, 600), quantizations)
 def test_request_wire_bytes_grows_with_every_token(k: int, quantization: str) -> None:
     for tcp_ip in (False, True):

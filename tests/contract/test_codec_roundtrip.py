@@ -48,6 +48,7 @@ def features(count: int, seed: int = 0) -> NDArray[np.float32]:
     return tokens
 
 
+@settings(deadline=None)
 @given(token_sets())
 def test_float32_is_lossless(case: tuple) -> None:
     tokens, positions, towers = case
@@ -57,6 +58,7 @@ def test_float32_is_lossless(case: tuple) -> None:
     assert (decoded.dtype, places.dtype) == (np.float32, np.int32)
 
 
+@settings(deadline=None)
 @given(token_sets(largest=65504))
 def test_float16_rounds_to_the_nearest_half(case: tuple) -> None:
     tokens, positions, towers = case
@@ -66,6 +68,7 @@ def test_float16_rounds_to_the_nearest_half(case: tuple) -> None:
     np.testing.assert_array_equal(places, positions)
 
 
+@settings(deadline=None)
 @given(token_sets())
 def test_int8_errs_by_half_a_step_of_each_token_and_tower(case: tuple) -> None:
     tokens, positions, towers = case
@@ -79,6 +82,7 @@ def test_int8_errs_by_half_a_step_of_each_token_and_tower(case: tuple) -> None:
     np.testing.assert_array_equal(places, positions)
 
 
+@settings(deadline=None)
 @given(token_sets())
 def test_int4_errs_by_half_a_step_of_each_token_and_has_16_levels(case: tuple) -> None:
     tokens, positions, towers = case
@@ -165,7 +169,7 @@ def test_tokens_do_not_influence_each_other(quantization: str) -> None:
         np.testing.assert_array_equal(alone[0], together[index])
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(st.permutations(range(8)), st.sampled_from(codec.QUANTIZATIONS))
 def test_order_is_kept(order: list[int], quantization: str) -> None:
     tokens = np.arange(8, dtype=np.float32)[order, None] * np.ones((1, 3), np.float32)

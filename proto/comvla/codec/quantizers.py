@@ -278,7 +278,7 @@ def _require_scales(scales: FloatArray) -> None:
     if not sound.all():
         token = int(np.argwhere(~sound)[0][0])
         raise CodecError(
-            f"expected finite, positive scales, got {scales[token].tolist()} in token {token}: "
+            f"expected positive, finite scales, got {scales[token].tolist()} in token {token}: "
             "the payload is damaged"
         )
 
