@@ -47,7 +47,9 @@ def tiny_config() -> ModelConfig:
 
 @pytest.fixture(scope="module")
 def golden():
-    return {k: v for f in ("inputs", "golden_oft_fp32") for k, v in np.load(GOLDEN / f"{f}.npz").items()}
+    return {
+        k: v for f in ("inputs", "golden_oft_fp32") for k, v in np.load(GOLDEN / f"{f}.npz").items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,9 @@ def halves():
     tensors = load_file(folder / "model.safetensors")
     for module in ("action_head", "proprio_projector"):
         side = torch.load(folder / f"{module}--latest_checkpoint.pt", weights_only=True)
-        tensors |= {f"{module}.{name.removeprefix('module.')}": value for name, value in side.items()}
+        tensors |= {
+            f"{module}.{name.removeprefix('module.')}": value for name, value in side.items()
+        }
     edge, cloud = join(tiny_config())
     with torch.no_grad():
         load_published(edge, tensors, "reference")
@@ -72,7 +76,9 @@ def test_epsilons_are_the_published_ones(halves):
     """At the tolerance of these tests a wrong epsilon would pass unseen."""
     edge, cloud = halves
     assert cloud.backbone.norm.eps == cloud.backbone.layers[1].input_layernorm.eps == 1e-6
-    assert all(edge.vision_backbone.get_submodule(n).blocks[0].norm1.eps == 1e-6 for n in TOWER_NAMES)
+    assert all(
+        edge.vision_backbone.get_submodule(n).blocks[0].norm1.eps == 1e-6 for n in TOWER_NAMES
+    )
     assert cloud.action_head.layer_norm1.eps == cloud.action_head.layer_norm2.eps == 1e-5
 
 
@@ -101,5 +107,7 @@ def test_actions_from_the_whole_sequence(halves, golden):
     actions, _ = cloud([projected], [torch.arange(512)], [ids], state)
     close(actions[0], golden["normalized_actions"])
     table = json.loads((GOLDEN / "ckpt_oft" / "dataset_statistics.json").read_text())
-    real = pick_statistics(table, None, "reference").unnormalise_actions(actions[0].detach().numpy())
+    real = pick_statistics(table, None, "reference").unnormalise_actions(
+        actions[0].detach().numpy()
+    )
     np.testing.assert_allclose(real, golden["actions"], atol=TOLERANCE)

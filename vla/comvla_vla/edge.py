@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from comvla.errors import CheckpointError, InstructionError, ObservationError
-from comvla.model_info import ModelInfo
 from numpy.typing import NDArray
 from torch import Tensor
 
+from comvla.errors import CheckpointError, InstructionError, ObservationError
+from comvla.model_info import ModelInfo
 from comvla_vla.config import ModelConfig
 from comvla_vla.flops import edge_flops
 from comvla_vla.nets import EdgeNet

@@ -33,9 +33,11 @@ def last_row_attention(
         One (L,) float32 distribution for each sequence.
     """
     q, k = layer.self_attn.queries_and_keys(layer.input_layernorm(rows), cos, sin)
-    out = []
-    for q_, k_ in zip(q.split(list(lengths)), k.split(list(lengths)), strict=True):
-        scores = torch.einsum("hc,lhc->hl", q_[-1], k_) / math.sqrt(q.shape[-1])
+    out: list[Tensor] = []
+    end = 0
+    for length in lengths:
+        start, end = end, end + length
+        scores = torch.einsum("hc,lhc->hl", q[end - 1], k[start:end]) / math.sqrt(q.shape[-1])
         out.append(scores.float().softmax(dim=-1).mean(dim=0))
     return out
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from comvla.errors import CheckpointError
 from torch import Tensor, nn
+
+from comvla.errors import CheckpointError
 
 _PREFIXES = (
     ("backbone.", "language_model.model."),

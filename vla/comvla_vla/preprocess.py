@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from comvla.errors import ObservationError
 from numpy.typing import NDArray
 from torch import Tensor
 
+from comvla.errors import ObservationError
 from comvla_vla.config import ModelConfig, TowerConfig
 
 

@@ -15,12 +15,13 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 HALF = (0.5, 0.5, 0.5)
 
 # Every word that the small policy is trained on; instructions are made of these and no others.
-MINI_WORDS = tuple(
-    (
-        "the green yellow grey black brown drawer button faucet lever window pull push press turn lower slide "
-        "open shut firmly gently left right leftwards rightwards"
-    ).split()
+# fmt: off
+MINI_WORDS = (
+    "the", "green", "yellow", "grey", "black", "brown", "drawer", "button", "faucet", "lever",
+    "window", "pull", "push", "press", "turn", "lower", "slide", "open", "shut", "firmly",
+    "gently", "left", "right", "leftwards", "rightwards",
 )
+# fmt: on
 
 
 def mini(vocab: int = 3 + len(MINI_WORDS)) -> ModelConfig:

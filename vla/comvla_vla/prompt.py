@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from comvla.errors import InstructionError
 from tokenizers import Tokenizer
 from tokenizers.models import WordLevel
 from tokenizers.normalizers import Lowercase
 from tokenizers.pre_tokenizers import Punctuation, WhitespaceSplit
 from tokenizers.pre_tokenizers import Sequence as PreTokenizers
 
+from comvla.errors import InstructionError
 from comvla_vla.config import PromptConfig
 
 UNKNOWN, BOS, STOP = "<unk>", "<s>", "</s>"

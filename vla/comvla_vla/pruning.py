@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from comvla_vla.backbone import Backbone, RMSNorm
+from comvla_vla.backbone import Backbone, Layer, RMSNorm
 from comvla_vla.config import BackboneConfig
 
 _LIGHTVLA_EPS = 1e-6
@@ -53,6 +53,14 @@ def text_driven_scores(queries: Tensor, keys: Tensor) -> Tensor:
     return scores.float().mean(dim=(0, 1))
 
 
+class QueryKey(nn.Module):
+    """Query and key weights of one attention layer, in one matrix."""
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.qk_proj = nn.Linear(hidden, 2 * hidden, bias=False)
+
+
 class TextProbe(nn.Module):
     """Norm, query and key weights of the backbone's first layer: VLA-ADP's share of the robot's half."""
 
@@ -60,15 +68,13 @@ class TextProbe(nn.Module):
         super().__init__()
         self.config = config
         self.input_layernorm = RMSNorm(config.hidden, config.rms_eps)
-        self.self_attn = nn.Module()
-        self.self_attn.qk_proj = nn.Linear(config.hidden, 2 * config.hidden, bias=False)
+        self.self_attn = QueryKey(config.hidden)
 
     def forward(self, words: Tensor, visual: Tensor) -> Tensor:
         """Embedded words (T, d) and projected visual tokens (N, d) to scores (N,)."""
         hidden = self.config.hidden
         heads = (-1, self.config.heads, self.config.head_dim)
         weight = self.self_attn.qk_proj.weight
-        assert isinstance(weight, Tensor)
         queries = F.linear(self.input_layernorm(words), weight[:hidden]).view(heads)
         keys = F.linear(self.input_layernorm(visual), weight[hidden:]).view(heads)
         return text_driven_scores(queries, keys)
@@ -77,6 +83,7 @@ class TextProbe(nn.Module):
     def copy_from(self, backbone: Backbone) -> None:
         """Takes the weights of a backbone's first layer."""
         first = backbone.layers[0]
+        assert isinstance(first, Layer)
         rows = 2 * self.config.hidden
         self.input_layernorm.weight.copy_(first.input_layernorm.weight)
         self.self_attn.qk_proj.weight.copy_(first.self_attn.qkv_proj.weight[:rows])

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from comvla.errors import CheckpointError
 from numpy.typing import NDArray
+
+from comvla.errors import CheckpointError
 
 # OpenVLA divides by (q99 - q01 + 1e-8) and multiplies by the same on the way back.
 _EPSILON = 1e-8

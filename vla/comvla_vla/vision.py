@@ -81,7 +81,7 @@ class Projector(nn.Module):
             x = self.norm(x)
         if self.config.projector.positions == "sine2d":
             _, rows, columns = self.config.grid
-            sines = cast(Tensor, self.sines)
+            sines = self.sines
             where = sines.repeat(self.config.views, 1) + self.view_embed.repeat_interleave(
                 rows * columns, 0
             )

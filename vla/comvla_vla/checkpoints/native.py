@@ -1,0 +1,99 @@
+"""This project's own format: a folder with one half or both, in safetensors and JSON.
+
+``config.json`` holds format, half, fingerprint and model; ``model.safetensors`` names as OpenVLA-OFT publishes them,
+side modules under ``action_head.`` and ``proprio_projector.``; beside them ``dataset_statistics.json`` and
+``tokenizer.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from comvla.errors import CheckpointError
+from comvla_vla.checkpoints.opened import Checkpoint
+from comvla_vla.checkpoints.tensors import open_safetensors
+from comvla_vla.config import ModelConfig
+
+CONFIG, WEIGHTS, STATISTICS, TOKENIZER = (
+    "config.json",
+    "model.safetensors",
+    "dataset_statistics.json",
+    "tokenizer.json",
+)
+FORMAT = "comvla-1"
+
+
+def open_native(folder: Path, header: Mapping[str, Any]) -> Checkpoint:
+    """Opens a folder of this format.
+
+    Raises:
+        CheckpointError: incomplete or damaged.
+    """
+    missing = {"model", "fingerprint", "half"} - set(header)
+    if missing or header["half"] not in ("whole", "edge", "cloud"):
+        raise CheckpointError(
+            f"{folder / CONFIG} lacks {sorted(missing) or 'a known half'}: the checkpoint is damaged, copy it again"
+        )
+    return Checkpoint(
+        where=str(folder),
+        half=header["half"],
+        config=ModelConfig.from_dict(header["model"]),
+        statistics=read_json(folder / STATISTICS, "the data-set statistics"),
+        tokenizer=read_text(folder / TOKENIZER, "the tokenizer"),
+        tensors=open_safetensors(folder / WEIGHTS),
+        fingerprint=str(header["fingerprint"]),
+    )
+
+
+def write_around(folder: Path, checkpoint: Checkpoint, half: str, digest: str) -> None:
+    """Writes everything but the weights."""
+    header = {
+        "format": FORMAT,
+        "half": half,
+        "fingerprint": digest,
+        "model": checkpoint.config.to_dict(),
+    }
+    (folder / CONFIG).write_text(json.dumps(header, indent=1) + "\n")
+    (folder / STATISTICS).write_text(json.dumps(checkpoint.statistics, indent=1) + "\n")
+    (folder / TOKENIZER).write_text(checkpoint.tokenizer)
+
+
+def publish(partial: Path, folder: Path) -> None:
+    """Puts a finished folder in its place in one move, readable for services under other accounts."""
+    for file in partial.rglob("*"):
+        if file.is_file():
+            file.chmod(0o644)
+    if folder.exists():
+        shutil.rmtree(folder)
+    partial.rename(folder)
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        CheckpointError: unreadable, or something else.
+    """
+    try:
+        table = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"cannot read {what} {path}: {error}") from error
+    if not isinstance(table, dict):
+        raise CheckpointError(f"cannot read {what} {path}: it holds no mapping")
+    return table
+
+
+def read_text(path: Path, what: str) -> str:
+    """A text file.
+
+    Raises:
+        CheckpointError: unreadable.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"cannot read {what} {path}: {error}") from error
