@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from comvla.errors import ObservationError
+from comvla_vla import tf_images
 from comvla_vla.config import ModelConfig, TowerConfig
 
 
-def check_images(images: Sequence[NDArray[np.uint8]], config: ModelConfig) -> NDArray[np.uint8]:
-    """Stacks the views (views, H, W, 3) after checking number, type and shape.
+def check_images(
+    images: Sequence[NDArray[np.uint8]], config: ModelConfig
+) -> list[NDArray[np.uint8]]:
+    """The views, each (H, W, 3), after checking number, type and shape.
 
     Raises:
         ObservationError: naming what was expected, what came, and which view it was.
@@ -30,11 +33,15 @@ def check_images(images: Sequence[NDArray[np.uint8]], config: ModelConfig) -> ND
             raise ObservationError(
                 f"view {i}: expected a uint8 array of shape (H, W, 3), RGB, got {kind}"
             )
-        if image.shape != (side, side, 3):
+        if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+            raise ObservationError(
+                f"view {i}: expected a picture (H, W, 3), RGB, got {image.shape}"
+            )
+        if config.preprocess == "exact" and image.shape[:2] != (side, side):
             raise ObservationError(
                 f"view {i}: {config.name} expects ({side}, {side}, 3) pixels, got {image.shape}: resize the picture"
             )
-    return np.stack([np.ascontiguousarray(image) for image in images])
+    return list(images)
 
 
 def normalise(pixels: Tensor, towers: Sequence[TowerConfig]) -> Tensor:
@@ -53,5 +60,11 @@ def preprocess(images: Sequence[NDArray[np.uint8]], config: ModelConfig) -> Tens
 
     Raises:
         ObservationError: see :func:`check_images`.
+        DependencyError: OpenVLA's pre-processing needs packages that are not installed.
     """
-    return normalise(torch.from_numpy(check_images(images, config)), config.towers)
+    views = check_images(images, config)
+    if config.preprocess == "openvla":
+        side = config.towers[0].image_size
+        views = [tf_images.prepare(view, side) for view in views]
+    stacked = np.stack([np.ascontiguousarray(view) for view in views])
+    return normalise(torch.from_numpy(stacked), config.towers)
