@@ -31,6 +31,9 @@ from comvla_client.sizing import Budget, TokenSizer
 from comvla_client.snr import SnrInput, SnrReading, as_reading, as_source
 from comvla_client.uplink import TokenUplink
 
+WIND_UP_S = 0.002
+"""What is kept of a deadline for giving up a call and writing the report, in seconds."""
+
 _SESSION_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@/+=-]{0,99}")
 
 
@@ -42,7 +45,7 @@ class Prepared:
         request: what to send; None when the link carries nothing.
         report: the account so far.
         started: when the step began, on ``time.perf_counter``.
-        deadline: when it has to be over, on the same clock.
+        deadline: when its call has to be over, on the same clock.
     """
 
     request: InferRequest | None
@@ -142,7 +145,7 @@ class ClientCore:
             capacity_bits=size.capacity_bits,
             token_budget=size.budget,
         )
-        deadline = started + self.deadline_s
+        deadline = started + self.deadline_s - min(WIND_UP_S, 0.1 * self.deadline_s)
         rng = np.random.default_rng([self._seed, self._episode, self._step])
         self._step += 1
         if size.count == 0:

@@ -109,8 +109,6 @@ def _check_proprio(proprio: object, info: ModelInfo) -> npt.NDArray[np.float32]:
         with np.errstate(over="ignore"):
             values = values.astype(np.float32)
     except (TypeError, ValueError, RuntimeError) as error:
-        if info.proprio_dim == 0:
-            return np.zeros(0, dtype=np.float32)
         raise ObservationError(
             f"expected obs['proprio'] as {info.proprio_dim} numbers ({info.name}), got "
             f"{_describe(proprio)} ({error}): pass a float array"

@@ -26,7 +26,8 @@ from client_stubs import (
 )
 
 from comvla.errors import HandshakeError, InstructionError, ObservationError
-from comvla_client import AsyncComVLAClient, ClientClosedError, ComVLAClient
+from comvla.v1.policy_pb2 import InferRequest
+from comvla_client import AsyncComVLAClient, ClientClosedError, ComVLAClient, TransportError
 from comvla_client.transport_aio import GrpcAioTransport
 
 OBS = observation()
@@ -35,7 +36,7 @@ REFUSED = "127.0.0.1:1"
 
 
 def aio_client_of(target: Any, **options: Any) -> AsyncComVLAClient:
-    options = {"link": NARROW, "edge": StubEdge(), "budget": 4, **options}
+    options = {"link": NARROW, "edge": StubEdge(), "budget": 4, "deadline_s": 20.0, **options}
     return AsyncComVLAClient(target, **options)
 
 
@@ -112,22 +113,27 @@ async def test_a_server_that_never_answers() -> None:
     service.before = never_answer
     with serving(service) as (target, _):
         async with aio_client_of(target, deadline_s=0.03) as client:
-            overruns = []
-            for _ in range(30):
+            overruns_s, lateness_s = [], []
+            for _ in range(50):
                 began = time.perf_counter()
                 report = (await client.step(OBS, WORDS)).report
-                overruns.append(time.perf_counter() - began - 0.03)
+                overruns_s.append(time.perf_counter() - began - client.deadline_s)
                 assert report.fallback_reason == "deadline"
-            assert np.median(overruns) < 0.010
+                # How late this machine wakes anybody now: that much more is allowed.
+                began = time.perf_counter()
+                await asyncio.sleep(0.005)
+                lateness_s.append(time.perf_counter() - began - 0.005)
+            assert np.percentile(overruns_s, 95) <= 0.010 + np.percentile(lateness_s, 95)
             service.before = None
-            assert (await client.step(OBS, WORDS)).source == "cloud"
+            chunks = [await client.step(OBS, WORDS) for _ in range(5)]
+            assert "cloud" in [chunk.source for chunk in chunks]
 
 
 async def test_a_server_that_returns_is_found_by_the_first_step_after_it() -> None:
     with serving() as (target, _):
-        client = aio_client_of(target, deadline_s=0.2)
+        client = aio_client_of(target, deadline_s=0.5)
         assert (await client.step(OBS, WORDS)).source == "cloud"
-    for _ in range(8):
+    for _ in range(4):
         assert (await client.step(OBS, WORDS)).report.fallback_reason == "unavailable"
     with serving(port=int(target.rpartition(":")[2])):
         assert (await client.step(OBS, WORDS)).source == "cloud"
@@ -211,6 +217,22 @@ async def test_an_edge_half_that_takes_all_the_time_sends_nothing() -> None:
         assert client.deadline_s == 1e-9
         assert (await client.step(OBS, WORDS)).report.fallback_reason == "deadline"
     assert transport.inner.requests == []
+
+
+async def test_a_server_that_stays_silent_gets_a_new_connection() -> None:
+    service = StubService()
+    service.before = never_answer
+    with serving(service) as (target, _):
+        transport = GrpcAioTransport(target)
+        channels = set()
+        for _ in range(3):
+            with pytest.raises(TransportError, match="DEADLINE_EXCEEDED"):
+                await transport.infer(InferRequest(), 0.03)
+            channels.add(transport._channel)
+        assert len(channels) == 2
+        await transport.close()
+        with pytest.raises(ClientClosedError):
+            await transport.get_model(1.0)
 
 
 async def test_a_target_is_host_and_port() -> None:

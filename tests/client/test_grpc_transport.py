@@ -35,6 +35,8 @@ REFUSED = "127.0.0.1:1"  # nothing listens on a port that only root may open
 
 
 def client_of(target: str, **options: Any) -> ComVLAClient:
+    # Where a test is not about time, a deadline that a busy machine can keep.
+    options = {"deadline_s": 20.0, **options}
     return ComVLAClient(target, edge=StubEdge(), link=NARROW, budget=4, **options)
 
 
@@ -79,29 +81,22 @@ def web_server() -> Iterator[str]:
         server.server_close()
 
 
-def overruns_s(client: ComVLAClient, steps: int) -> np.ndarray:
-    """By how much each of some unanswered steps exceeded the deadline, in seconds."""
-    overruns = []
-    for _ in range(steps):
-        began = time.perf_counter()
-        chunk = client.step(OBS, WORDS)
-        overruns.append(time.perf_counter() - began - client.deadline_s)
-        assert chunk.report.fallback_reason == "deadline"
-        assert chunk.source == "hold"
-    return np.array(overruns)
-
-
 def assert_returns_in_time(client: ComVLAClient) -> None:
-    """At the 99th percentile within 10 ms of the deadline. A machine busy with something else gets
-    three tries; a client that does not watch its own clock fails them all."""
-    percentiles = []
-    for _ in range(3):
-        overruns = overruns_s(client, steps=100)
-        assert overruns.max() < 1.0
-        percentiles.append(float(np.percentile(overruns, 99)))
-        if percentiles[-1] <= 0.010:
-            return
-    pytest.fail(f"99th percentiles beyond the deadline: {percentiles} s")
+    """At the 99th percentile within 10 ms of the deadline.
+
+    A machine that is busy with something else wakes every waiter late. How late is measured with a
+    bare wait beside each step, and that much more is allowed: on an idle machine next to nothing.
+    """
+    overruns_s, lateness_s, never = [], [], threading.Event()
+    for _ in range(200):
+        began = time.perf_counter()
+        report = client.step(OBS, WORDS).report
+        overruns_s.append(time.perf_counter() - began - client.deadline_s)
+        assert (report.source, report.fallback_reason) == ("hold", "deadline")
+        began = time.perf_counter()
+        never.wait(0.005)
+        lateness_s.append(time.perf_counter() - began - 0.005)
+    assert np.percentile(overruns_s, 99) <= 0.010 + np.percentile(lateness_s, 99)
 
 
 def test_a_step_over_a_real_socket() -> None:
@@ -118,7 +113,8 @@ def test_a_server_that_accepts_the_call_and_never_answers() -> None:
     with serving(service) as (target, _), client_of(target, deadline_s=0.02) as client:
         assert_returns_in_time(client)
         service.before = None
-        assert client.step(OBS, WORDS).source == "cloud"
+        chunks = [client.step(OBS, WORDS) for _ in range(10)]
+        assert "cloud" in [chunk.source for chunk in chunks]
 
 
 def test_a_socket_that_accepts_and_never_speaks() -> None:
@@ -131,16 +127,16 @@ def test_a_socket_that_accepts_and_never_speaks() -> None:
 
 def test_a_server_that_returns_is_found_by_the_first_step_after_it() -> None:
     with serving() as (target, _):
-        client = client_of(target, deadline_s=0.2)
+        client = client_of(target, deadline_s=0.5)
         assert client.step(OBS, WORDS).source == "cloud"
     with client:
-        for _ in range(10):  # longer than gRPC's first pauses between attempts
+        for _ in range(4):  # longer than gRPC's own first pauses between attempts
             report = client.step(OBS, WORDS).report
             assert (report.source, report.fallback_reason) == ("hold", "unavailable")
         with serving(port=int(target.rpartition(":")[2])):
             chunk = client.step(OBS, WORDS)
             assert chunk.source == "cloud"
-            assert chunk.report.step == 11
+            assert chunk.report.step == 5
 
 
 def test_a_step_waits_for_a_server_that_returns_within_its_deadline() -> None:
