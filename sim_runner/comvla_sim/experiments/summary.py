@@ -65,8 +65,8 @@ def _counts(rows: Sequence[Row], key: str = "success") -> dict[str, Any]:
     return {
         "episodes": len(rows),
         "successes": successes,
-        "low": round(low, 4),
-        "high": round(high, 4),
+        "low": round(low, 6),
+        "high": round(high, 6),
     }
 
 

@@ -1,0 +1,184 @@
+"""``comvla-sim eval`` from its options to its JSON, stopped and resumed on the way."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from comvla_server.background import BackgroundServer
+from comvla_server.engine import Engine
+from comvla_server.settings import ServerSettings
+from comvla_sim import cli
+from comvla_sim.experiments import command
+from comvla_sim.experiments.runner import Worker
+from comvla_sim.worlds.tabletop import Tabletop
+from comvla_vla import random_policy
+
+pytestmark = pytest.mark.simulator
+
+
+@pytest.fixture(autouse=True)
+def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Tabletop, "max_episode_steps", 8)
+
+
+def evaluate(out: Path, *options: str) -> int:
+    fixed = ["eval", "--model", "random", "--episodes", "2", "--workers", "1", "--out", str(out)]
+    return cli.main([*fixed, *options])
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_the_json_has_rows_with_intervals_and_the_file_everything_to_repeat_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "results.jsonl"
+    options = ("--method", "full,hard_voting", "--k", "16,4", "--instructions")
+    assert evaluate(out, *options, "drawer-open,lower the black lever gently", "--json") == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert len(printed["rows"]) == 3 * 2
+    for row in printed["rows"]:
+        assert row["episodes"] == 2
+        assert 0 <= row["low"] <= row["successes"] / 2 <= row["high"] <= 1
+        assert row["instruction"] in ("pull the green drawer open", "lower the black lever gently")
+        assert {"method", "k"} <= set(row)
+    assert {(a["method"], a["k"]) for a in printed["aggregate"]} == {
+        ("full", 512),
+        ("hard_voting", 16),
+        ("hard_voting", 4),
+    }
+    assert printed["results"] == str(out)
+    lines = read(out)
+    assert len(lines) == 3 * 2 * 2
+    for line in lines:
+        assert line["settings"]["model_fingerprint"] == random_policy(0)[0].info.fingerprint
+        assert line["settings"]["versions"]["mujoco"]
+        assert line["environment"]["transport"] == "in-process"
+        assert line["environment"]["command"]
+
+
+def test_a_second_run_measures_only_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "results.jsonl"
+    options = ("--method", "hard_voting", "--k", "16", "--instructions", "drawer-open", "--json")
+    assert evaluate(out, *options) == 0
+    first = json.loads(capsys.readouterr().out)
+    ran: list[object] = []
+    run = Worker.run
+
+    def counted(self: Worker, spec: Any) -> Any:
+        ran.append(spec)
+        return run(self, spec)
+
+    monkeypatch.setattr(Worker, "run", counted)
+    assert evaluate(out, *options) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert not ran
+    assert evaluate(out, *options[:3], "16,4", *options[4:]) == 0
+    assert [(spec.k, spec.episode) for spec in ran] == [(4, 0), (4, 1)]
+    assert len(read(out)) == 4
+
+
+def test_ctrl_c_leaves_a_file_that_the_same_command_completes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "results.jsonl"
+    options = ("--method", "hard_voting", "--k", "16", "--instructions", "drawer-open")
+
+    @contextmanager
+    def interrupting(total: int, done: int) -> Iterator[Any]:
+        def interrupt(row: dict[str, Any]) -> None:
+            raise KeyboardInterrupt
+
+        yield interrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "_bar", interrupting)
+        assert evaluate(out, *options) == 130
+    assert len(read(out)) == 1
+    assert str(out) in capsys.readouterr().err
+    assert evaluate(out, *options) == 0
+    assert [line["episode"] for line in read(out)] == [0, 1]
+    assert "Success over all instructions" in capsys.readouterr().out
+
+
+def test_two_processes_and_a_real_server_measure_the_same_as_one_process(
+    tmp_path: Path,
+) -> None:
+    """Worker processes do not see this test's patches, so their episodes have full length."""
+    Tabletop.max_episode_steps = 160  # undone by the fixture
+    options = ("--method", "random", "--k", "8", "--instructions", "lever-down", "--condition")
+    with BackgroundServer(Engine(random_policy(0)[1]), ServerSettings()) as server:
+        remote = ("--workers", "2", "--target", server.target)
+        assert evaluate(tmp_path / "remote.jsonl", *options, "normal", *remote) == 0
+    assert evaluate(tmp_path / "local.jsonl", *options, "normal") == 0
+    rows = {}
+    for name in ("remote", "local"):
+        rows[name] = sorted(read(tmp_path / f"{name}.jsonl"), key=lambda row: row["episode"])
+        for row in rows[name]:
+            del row["wall_s"], row["environment"]
+            # A session's name has another length with every connection.
+            del row["framed_bytes"]
+    assert rows["remote"] == rows["local"]
+
+
+def test_a_file_of_another_seed_is_not_continued(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "results.jsonl"
+    options = ("--method", "full", "--instructions", "drawer-open")
+    assert evaluate(out, *options) == 0
+    assert evaluate(out, *options, "--seed", "1") == 2
+    assert "seed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--method", "telepathy"), "telepathy"),
+        (("--k", "600"), "512"),
+        (("--instructions", "make-coffee"), "make-coffee"),
+        (("--quantization", "int2"), "int4"),
+        (("--world", "moon"), "moon"),
+        (("--model", "/nowhere/at/all"), "/nowhere/at/all"),
+        (("--episodes", "9999"), "--episodes"),
+        (("--workers", "-1"), "--workers"),
+    ],
+)
+def test_nonsense_is_refused_before_anything_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], message: str
+) -> None:
+    out = tmp_path / "results.jsonl"
+    assert evaluate(out, *options) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("comvla-sim: ")
+    assert message in error
+    assert "Traceback" not in error
+    assert not out.exists()
+
+
+def test_a_target_that_is_no_address_is_a_message(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--method", "full", "--instructions", "drawer-open", "--target", "nobody")
+    assert evaluate(tmp_path / "results.jsonl", *options) == 2
+    assert "nobody" in capsys.readouterr().err
+
+
+def test_without_a_name_the_file_is_named_after_what_must_not_be_mixed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fixed = ["eval", "--model", "random", "--episodes", "1", "--workers", "1", "--seed", "5"]
+    assert cli.main([*fixed, "--method", "full", "--instructions", "drawer-open"]) == 0
+    (path,) = tmp_path.glob("runs/eval/*.jsonl")
+    fingerprint = random_policy(0)[0].info.fingerprint
+    assert path.name == f"tabletop-comvla-mini-{fingerprint[:8]}-int8-seed5.jsonl"

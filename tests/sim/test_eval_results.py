@@ -1,0 +1,94 @@
+"""The results file survives crashes and refuses to mix measurements."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from eval_stubs import SETTINGS, made_up_row
+
+from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.results import ResultsFile, read_rows, spec_of
+
+
+def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "results.jsonl"
+    rows = [made_up_row(episode=episode) for episode in range(3)]
+    with ResultsFile(path, SETTINGS) as results:
+        for row in rows:
+            results.append(row)
+    with ResultsFile(path, SETTINGS) as results:
+        assert list(results) == rows
+        assert set(results.rows) == {spec_of(row) for row in rows}
+
+
+@pytest.mark.parametrize("cut", [1, 40, 400])
+def test_a_line_that_a_crash_cut_off_is_forgotten_and_written_over(
+    tmp_path: Path, cut: int
+) -> None:
+    path = tmp_path / "results.jsonl"
+    first, second, third = (json.dumps(made_up_row(episode=e)) + "\n" for e in range(3))
+    path.write_text(first + second[:-cut])
+    with ResultsFile(path, SETTINGS) as results:
+        assert [row["episode"] for row in results] == [0]
+        results.append(json.loads(third))
+    assert path.read_text() == first + third
+
+
+def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    path.write_text(json.dumps(made_up_row(quantization="int4")) + "\n")
+    with pytest.raises(EvaluationError, match=r"quantization 'int4'.*'int8'.*--out"):
+        ResultsFile(path, SETTINGS)
+
+
+def test_two_evaluations_cannot_write_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    with (
+        ResultsFile(path, SETTINGS),
+        pytest.raises(EvaluationError, match="another evaluation"),
+    ):
+        ResultsFile(path, SETTINGS)
+    with ResultsFile(path, SETTINGS) as later:
+        later.append(made_up_row())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"not json\n", "line 1"),
+        (b'{"format": 1}\n', "line 1"),
+        (b"[1, 2]\n", "line 1"),
+        (b"\xff\xfe\n", "line 1"),
+        (json.dumps({**made_up_row(), "format": 99}).encode() + b"\n", "format 99"),
+    ],
+)
+def test_a_file_of_something_else_is_left_alone(
+    tmp_path: Path, content: bytes, message: str
+) -> None:
+    path = tmp_path / "precious.txt"
+    path.write_bytes(content)
+    with pytest.raises(EvaluationError, match=message):
+        ResultsFile(path, SETTINGS)
+    assert path.read_bytes() == content
+
+
+def test_a_folder_or_a_missing_file_is_no_results_file(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="cannot read"):
+        read_rows(tmp_path / "missing.jsonl")
+    with pytest.raises(EvaluationError, match="cannot read"):
+        ResultsFile(tmp_path, SETTINGS)
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(EvaluationError, match="cannot write"):
+        ResultsFile(blocked / "results.jsonl", SETTINGS)
+
+
+def test_an_episode_counts_once(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    twice = [made_up_row(success=True), made_up_row(success=False)]
+    path.write_text("".join(json.dumps(row) + "\n" for row in twice))
+    rows, complete = read_rows(path)
+    assert [row["success"] for row in rows] == [True]
+    assert complete == path.stat().st_size
