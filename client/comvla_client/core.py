@@ -78,6 +78,7 @@ class ClientCore:
         seed: int = 0,
     ) -> None:
         self.info: ModelInfo = edge.info
+        self._any_image_size = bool(getattr(edge, "any_image_size", False))
         self.queue = ActionQueue(self.info, execute=execute, hold=hold)
         self.deadline_s = _check_deadline(
             self.queue.execute * self.info.control_period_s if deadline_s is None else deadline_s
@@ -109,6 +110,7 @@ class ClientCore:
         self._episode += 1
         self._step = 0
         self.queue.clear()
+        self._uplink.reset()
 
     def accept_server(self, response: GetModelResponse) -> ModelInfo:
         """The handshake: the server's model, if it fits the robot's half.
@@ -132,7 +134,7 @@ class ClientCore:
             ObservationError, InstructionError, LinkError: input that no step can use.
         """
         started = time.perf_counter()
-        checked = check_observation(obs, self.info)
+        checked = check_observation(obs, self.info, any_size=self._any_image_size)
         queries = self._uplink.queries(check_instruction(instruction))
         reading = self._read_snr(snr)
         request = self._blank_request(instruction, checked.proprio.tolist(), reading)
@@ -154,9 +156,11 @@ class ClientCore:
         request.payload = uplink.payload
         report = replace(
             report,
-            tokens=size.count,
+            tokens=len(uplink.positions),
             positions=uplink.positions,
-            payload_bytes=codec.payload_bytes(size.count, self.info.token_dim, self._quantization),
+            payload_bytes=codec.payload_bytes(
+                len(uplink.positions), self.info.token_dim, self._quantization
+            ),
             encoded_bytes=len(uplink.payload),
             framed_bytes=codec.wire_bytes(request.ByteSize()),
             timings_s=dict.fromkeys(PHASES, 0.0) | uplink.timings_s,

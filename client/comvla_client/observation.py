@@ -29,12 +29,15 @@ class CheckedObservation:
     proprio: npt.NDArray[np.float32]
 
 
-def check_observation(obs: Observation, info: ModelInfo) -> CheckedObservation:
+def check_observation(
+    obs: Observation, info: ModelInfo, *, any_size: bool = False
+) -> CheckedObservation:
     """Checks and copies as little as possible.
 
     Args:
         obs: mapping with ``images`` and, where the model takes it, ``proprio``.
         info: what the model expects.
+        any_size: the edge model resizes pictures itself.
 
     Raises:
         ObservationError: what was expected, what came, and the remedy.
@@ -50,7 +53,7 @@ def check_observation(obs: Observation, info: ModelInfo) -> CheckedObservation:
                 f"expected obs[{key!r}] ({info.name} needs it), got keys {sorted(map(str, obs))}: "
                 "add it to the observation"
             )
-    images = _check_images(obs["images"], info)
+    images = _check_images(obs["images"], info, any_size)
     proprio = obs["proprio"] if info.proprio_dim else ()
     return CheckedObservation(images=images, proprio=_check_proprio(proprio, info))
 
@@ -72,7 +75,7 @@ def check_instruction(instruction: str) -> str:
     return instruction
 
 
-def _check_images(images: object, info: ModelInfo) -> list[npt.NDArray[np.uint8]]:
+def _check_images(images: object, info: ModelInfo, any_size: bool) -> list[npt.NDArray[np.uint8]]:
     views, (height, width) = info.grid[0], info.image_size
     is_stack = isinstance(images, np.ndarray) and images.ndim == 4
     if not is_stack and (not isinstance(images, Sequence) or isinstance(images, (str, bytes))):
@@ -92,7 +95,8 @@ def _check_images(images: object, info: ModelInfo) -> list[npt.NDArray[np.uint8]
                 f"expected view {index} as a uint8 NumPy array in 0 to 255, got {_describe(image)}: "
                 "convert it, e.g. (image * 255).round().astype(np.uint8) for floats in 0 to 1"
             )
-        if image.shape != (height, width, 3):
+        resizable = any_size and image.ndim == 3 and image.shape[2] == 3 and image.size > 0
+        if image.shape != (height, width, 3) and not resizable:
             raise ObservationError(
                 f"expected view {index} of shape ({height}, {width}, 3) ({info.name}), got "
                 f"{image.shape}: resize it, put RGB last, and drop any alpha channel"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, overload
 
 import numpy as np
 
@@ -105,6 +105,8 @@ class ScoringContext:
         queries: (Q, d) language queries of the instruction.
         grid: (views, rows, columns) of the tokens.
         rng: seeded anew for every step of every episode, so that a repeated run ranks alike.
+        edge: the edge model, for pruners that use its weights.
+        instruction: what the robot was told. proprio: (P,) raw proprioception.
     """
 
     tokens: Array
@@ -112,6 +114,9 @@ class ScoringContext:
     queries: Array
     grid: tuple[int, int, int]
     rng: np.random.Generator
+    edge: Any = None
+    instruction: str | None = None
+    proprio: NumpyArray | None = None
 
     @property
     def language_tokens(self) -> Array:
@@ -133,14 +138,16 @@ class Selector(Protocol):
 
     Attributes:
         uses_language: whether the projector has to run; without it the edge saves that work.
-        sends_all: whether all N tokens go, whatever the link carries.
+        sends_all: whether everything ranked goes, whatever the link carries.
+
+    One with a memory has a method ``reset()`` too, which the client calls when an episode begins.
     """
 
     uses_language: ClassVar[bool]
     sends_all: ClassVar[bool]
 
     def rank(self, context: ScoringContext) -> NumpyArray:
-        """All N positions, most important first: (N,) integers."""
+        """Positions to send, most important first: all N, or fewer where it prunes on its own."""
         ...
 
 
@@ -215,9 +222,12 @@ def make_selector(selector: str | Selector) -> Selector:
     """
     if not isinstance(selector, str):
         return selector
-    if selector not in SELECTORS:
+    from comvla_client.pruners import PRUNERS  # it builds on this module
+
+    known: dict[str, Callable[[], Selector]] = {**SELECTORS, **PRUNERS}
+    if selector not in known:
         raise ValueError(
-            f"expected a selector among {sorted(SELECTORS)}, got {selector!r}: "
+            f"expected a selector among {sorted(known)}, got {selector!r}: "
             "pass one of these names, or an object with a rank(context) method"
         )
-    return SELECTORS[selector]()
+    return known[selector]()

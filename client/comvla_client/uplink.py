@@ -59,6 +59,12 @@ class TokenUplink:
             self._instruction = instruction
         return self._queries
 
+    def reset(self) -> None:
+        """Begins a new episode, for selectors with a memory."""
+        forget = getattr(self._selector, "reset", None)
+        if forget is not None:
+            forget()
+
     def compress(
         self, obs: CheckedObservation, queries: Array, count: int, rng: np.random.Generator
     ) -> Uplink:
@@ -67,17 +73,29 @@ class TokenUplink:
         Args:
             obs: a checked observation.
             queries: (Q, d) language queries.
-            count: K, 1 to N.
+            count: K, 1 to N; a selector that ranks fewer sends fewer.
             rng: for selectors that draw.
         """
         info, timings_s = self._edge.info, {}
         watch = _Stopwatch()
-        tokens = self._edge.encode(obs.images)
+        if getattr(self._edge, "sees_instruction", False):
+            tokens = self._edge.encode(obs.images, self._instruction)  # type: ignore[call-arg]
+        else:
+            tokens = self._edge.encode(obs.images)
         timings_s["encode"] = watch.lap()
         uses_language = self._selector.uses_language
         projected = self._edge.project(tokens) if uses_language else None
         timings_s["project"] = watch.lap()
-        context = ScoringContext(tokens, projected, queries, info.grid, rng)
+        context = ScoringContext(
+            tokens,
+            projected,
+            queries,
+            info.grid,
+            rng,
+            edge=self._edge,
+            instruction=self._instruction,
+            proprio=obs.proprio,
+        )
         ranking = self._selector.rank(context)
         timings_s["score"] = watch.lap()
         positions = np.ascontiguousarray(ranking[:count], dtype=np.int32)
