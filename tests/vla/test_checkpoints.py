@@ -9,6 +9,9 @@ import stat
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
 from comvla.errors import CheckpointError
 from comvla_vla import (
     PolicyRequest,
@@ -21,8 +24,6 @@ from comvla_vla import (
 from comvla_vla.presets import MINI_WORDS
 from comvla_vla.prompt import word_tokenizer
 from comvla_vla.random import unit_statistics
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
 
 REQUEST = PolicyRequest(
     np.ones((5, 96), np.float32), np.arange(5), "press the button", np.zeros(4, np.float32)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
+
 from comvla_vla import PolicyRequest, random_policy
 from comvla_vla.flops import (
     backbone_flops,
@@ -15,7 +17,6 @@ from comvla_vla.flops import (
     vision_flops,
 )
 from comvla_vla.presets import openvla_oft
-from torch.utils.flop_counter import FlopCounterMode
 
 
 def test_eq5_by_hand():

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from comvla import codec
 from comvla.errors import InstructionError, ObservationError
 from comvla_vla import PolicyRequest, random_policy
 from comvla_vla.preprocess import normalise
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 INSTRUCTIONS = ("pull the green drawer open", "press the button", "slide the window leftwards")
 
