@@ -69,6 +69,8 @@ class BackgroundServer:
         Returns:
             True when every call in flight was answered.
         """
+        if self._thread.ident is None:
+            return True  # never started
         if self._thread.is_alive() and self._started.exception() is None:
             _, loop, stop = self._started.result()
             self._grace_s = grace_s

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from comvla.errors import ComVLAError
-from comvla_server import inspect_command, serve_command
+from comvla_server import inspect_command, serve_command, split_command
 from comvla_server.version import server_version
 
 _DESCRIPTION = """\
@@ -22,6 +22,7 @@ examples:
   comvla-server serve --model mini              the shipped policy, on this machine only
   comvla-server serve --port 0 --admin-port 0   free ports; the ready line names them
   comvla-server inspect mini                    what a checkpoint is and what a step costs
+  comvla-server split SRC DST --check           halves of a published checkpoint
   curl http://127.0.0.1:8080/metrics            what Prometheus scrapes
 
 exit codes: 0 done, 1 calls were cut off or something broke, 2 a wrong option, model or port
@@ -40,6 +41,7 @@ def build_parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     serve_command.add_parser(subparsers)
     inspect_command.add_parser(subparsers)
+    split_command.add_parser(subparsers)
     return parser
 
 

@@ -50,10 +50,10 @@ def server_options(settings: ServerSettings) -> list[tuple[str, int]]:
         ("grpc.max_receive_message_length", _HARD_CAP_FACTOR * settings.max_request_bytes),
         ("grpc.keepalive_permit_without_calls", 1),
         ("grpc.http2.min_ping_interval_without_data_ms", min_ping_ms),
-        ("grpc.http2.min_recv_ping_interval_without_data_ms", min_ping_ms),
-        # The server's own pings find robots that vanished without a word.
+        # The server's own pings find robots that vanished without a word, idle ones too.
         ("grpc.keepalive_time_ms", 30_000),
         ("grpc.keepalive_timeout_ms", 10_000),
+        ("grpc.http2.max_pings_without_data", 0),
     ]
 
 

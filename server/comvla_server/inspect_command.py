@@ -1,21 +1,17 @@
-"""``comvla-server inspect``: what a checkpoint is and what a step of it costs."""
+"""``comvla-server inspect``: what a checkpoint is, what it needs and what a step of it costs."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from comvla import codec
-from comvla_server.serve_command import load_engine
-
-if TYPE_CHECKING:  # torch takes seconds to import: --help does without it
-    from comvla_server.engine import Engine
 
 _DESCRIPTION = """\
-Load the cloud half of a checkpoint and describe it: sizes, fingerprint, and for several numbers
-of tokens K the bytes on the link and the operations in the cloud.
+Describe a checkpoint without loading it: sizes, fingerprint, parameters and memory of each half, and
+for several numbers of tokens K the bytes on the link and the operations in the cloud.
 """
 
 _TOKEN_COUNTS = (512, 256, 128, 64, 32, 16, 8, 4)
@@ -37,6 +33,9 @@ def add_parser(subparsers: Any) -> None:
         default="mini",
         help="checkpoint folder, hub repository, or mini, the shipped policy (default: mini)",
     )
+    parser.add_argument(
+        "--tokenizer", metavar="FILE", help="tokenizer.json, where a published checkpoint has none"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=run)
 
@@ -47,12 +46,18 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         CheckpointError: missing, damaged, foreign or incomplete.
     """
-    description = describe(load_engine(args.source, "cpu", "float32", None))
+    description = describe(args.source, args.tokenizer)
     if args.json:
         print(json.dumps(description))
         return 0
     for name, value in description["model"].items():
         print(f"{name:18} {value}")
+    print(f"\n{'half':6} {'tensors':>8} {'parameters':>14} {'float32 GB':>11} {'bfloat16 GB':>12}")
+    for half, size in description["halves"].items():
+        print(
+            f"{half:6} {size['tensors']:>8} {size['parameters']:>14,} "
+            f"{size['float32_bytes'] / 1e9:>11.3f} {size['bfloat16_bytes'] / 1e9:>12.3f}"
+        )
     print(
         f"\n{'K':>4} {'cloud GFLOPs':>13}" + "".join(f"{q + ' B':>12}" for q in codec.QUANTIZATIONS)
     )
@@ -62,27 +67,47 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def describe(engine: Engine) -> dict[str, Any]:
-    """Model description and cost table, ready for JSON. A multiply-add counts as two FLOPs."""
-    info = engine.info
-    counts = [k for k in _TOKEN_COUNTS if k < info.num_tokens]
+def describe(source: str, tokenizer: str | None = None) -> dict[str, Any]:
+    """Model description, sizes of the halves and cost table, ready for JSON. A multiply-add counts as two FLOPs.
+
+    Raises:
+        CheckpointError: missing, damaged, foreign or incomplete.
+    """
+    import torch
+    from comvla_vla.checkpoints import model_info, open_checkpoint
+    from comvla_vla.checkpoints.accounting import HALVES, half_size
+
+    checkpoint = open_checkpoint(source, "any", tokenizer=tokenizer)
+    config = checkpoint.config
+    statistics = checkpoint.chosen_statistics(sorted(checkpoint.statistics)[0])
+    info = model_info(config, checkpoint.identity(), statistics)
+    sizes = {half: half_size(half, config) for half in HALVES}
+    counts = [k for k in _TOKEN_COUNTS if k < config.num_tokens]
     return {
         "model": dataclasses.asdict(info),
+        "holds": checkpoint.half,
+        "halves": {
+            half: {
+                **dataclasses.asdict(size),
+                "float32_bytes": size.nbytes(torch.float32),
+                "bfloat16_bytes": size.nbytes(torch.bfloat16),
+            }
+            for half, size in sizes.items()
+        },
         "prompt_tokens": _PROMPT_TOKENS,
-        "steps": [_cost(engine, k) for k in (info.num_tokens, *counts)],
+        "steps": [_cost(config, k) for k in (config.num_tokens, *counts)],
     }
 
 
-def _cost(engine: Engine, k: int) -> dict[str, Any]:
-    info = engine.info
-    request = engine.blank_request(k, _PROMPT_TOKENS)
+def _cost(config: Any, k: int) -> dict[str, Any]:
+    from comvla_vla.flops import cloud_flops
+
+    towers = len(config.towers)
     return {
         "tokens": k,
-        "cloud_flops": engine.flops(request),
+        "cloud_flops": cloud_flops(config, k, _PROMPT_TOKENS),
         "encoded_bytes": {
-            quantization: codec.encoded_bytes(
-                k, info.token_dim, quantization, num_towers=len(info.tower_dims)
-            )
+            quantization: codec.encoded_bytes(k, config.token_dim, quantization, num_towers=towers)
             for quantization in codec.QUANTIZATIONS
         },
     }

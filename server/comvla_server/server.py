@@ -32,7 +32,7 @@ __all__ = ["Server", "ServerSettings"]
 _log = logging.getLogger(__name__)
 
 # Time for responses already written to leave the sockets, and for health watchers to be cut.
-_FLUSH_S = 0.2
+_FLUSH_S = 1.0
 # Envelope of a request around its payload: identifiers, instruction, proprioception.
 _ENVELOPE_BYTES = 16 * 1024
 

@@ -42,7 +42,7 @@ class Validator:
     max_request_bytes: int
 
     def check_identity(self, request: policy_pb2.InferRequest) -> None:
-        """Size, protocol, model and session: what can be told without looking at the content.
+        """Size, protocol, model, session and lengths: what can be told without reading the content.
 
         Raises:
             Refusal: oversize, mismatch or invalid.
@@ -75,6 +75,7 @@ class Validator:
                 f"that begins with a letter or digit, got {shown(request.session_id)}: "
                 "a UUID is a good choice",
             )
+        self._check_lengths(request)
 
     def read(self, request: policy_pb2.InferRequest) -> PolicyRequest:
         """Checks the content and decodes the tokens.
@@ -104,29 +105,30 @@ class Validator:
                 "monotonic clock"
             )
 
-    def _check_instruction(self, instruction: str) -> None:
-        if len(instruction) > MAX_INSTRUCTION_CHARS:
+    def _check_lengths(self, request: policy_pb2.InferRequest) -> None:
+        """Bounds the work of everything that follows, the digest first of all."""
+        if len(request.instruction) > MAX_INSTRUCTION_CHARS:
             raise _invalid(
                 f"expected an instruction of at most {MAX_INSTRUCTION_CHARS} characters, got "
-                f"{len(instruction)}: say it in fewer words"
+                f"{len(request.instruction)}: say it in fewer words"
             )
+        info, came = self.engine.info, len(request.proprio)
+        if came != info.proprio_dim:
+            raise _invalid(
+                f"expected {info.proprio_dim} proprioception values, got {came}: send the raw "
+                f"vector that {info.name} was trained with"
+                if info.proprio_dim
+                else f"expected no proprioception, got {came} values: {info.name} takes none"
+            )
+
+    def _check_instruction(self, instruction: str) -> None:
         try:
             self.engine.check_instruction(instruction)
         except InstructionError as error:
             raise _invalid(f"instruction {shown(instruction)}: {error}") from error
 
     def _proprio(self, request: policy_pb2.InferRequest) -> NDArray[np.float32] | None:
-        expected = self.engine.info.proprio_dim
-        came = len(request.proprio)
-        if came != expected:
-            raise _invalid(
-                f"expected {expected} proprioception values, got {came}: send the raw vector that "
-                f"{self.engine.info.name} was trained with"
-                if expected
-                else f"expected no proprioception, got {came} values: "
-                f"{self.engine.info.name} takes none"
-            )
-        if not expected:
+        if not self.engine.info.proprio_dim:
             return None
         proprio = np.asarray(request.proprio, dtype=np.float32)
         _check_values(proprio, "proprioception")

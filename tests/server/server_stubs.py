@@ -17,7 +17,7 @@ from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_vla.request import PolicyRequest
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 STUB_INFO = ModelInfo(
     name="stub",

@@ -10,21 +10,25 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import grpc
 import httpx
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from server_stubs import PATIENCE_S, Robot, eventually, message
+from server_stubs import PATIENCE_S, Robot, StubCloud, eventually, message
 
-from comvla_server import cli
+from comvla_server import cli, serve_command
+from comvla_server.engine import Engine
 from comvla_vla import random_policy, save_policy
 from comvla_vla.random import unit_statistics
 
 HERE = Path(__file__).parent
 FREE_PORTS = ("--port", "0", "--admin-port", "0")
+SERVING = health_pb2.HealthCheckResponse.SERVING
+NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
 READY = re.compile(r"comvla-server ready grpc=(\S+) admin=(http://\S+) model=(\S+)\n")
 
 
@@ -58,6 +62,14 @@ def end(running: subprocess.Popen[str]) -> tuple[int, str]:
     """Exit code and stderr of a process that is about to end."""
     _, stderr = running.communicate(timeout=PATIENCE_S)
     return running.returncode, stderr
+
+
+def health_of(robot: Robot) -> int | None:
+    """Serving status, None where nobody listens yet."""
+    with contextlib.suppress(grpc.RpcError):
+        stub = health_pb2_grpc.HealthStub(robot.channel)
+        return int(stub.Check(health_pb2.HealthCheckRequest(), timeout=PATIENCE_S).status)
+    return None
 
 
 @contextlib.contextmanager
@@ -94,17 +106,14 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
-def test_a_signal_completes_the_request_in_flight_and_exits_cleanly(
-    gate: Path, number: signal.Signals
-) -> None:
+def test_sigterm_completes_the_request_in_flight_and_exits_cleanly(gate: Path) -> None:
     with process(str(HERE / "gated_server.py"), str(gate), "serve", *FREE_PORTS) as running:
         target, admin, model = ready_line(running)
         assert model == "stub"
         with Robot(target) as robot:
             call = robot.send(message("in-flight"))
             with model_at(gate):
-                running.send_signal(number)
+                running.send_signal(signal.SIGTERM)
                 health = health_pb2_grpc.HealthStub(robot.channel)
                 asked = health_pb2.HealthCheckRequest()
                 eventually(
@@ -135,40 +144,62 @@ def test_a_second_signal_exits_at_once(gate: Path) -> None:
     assert code == 128 + signal.SIGTERM
 
 
-def test_calls_that_outlast_the_grace_are_an_exit_code(gate: Path) -> None:
-    arguments = ("serve", *FREE_PORTS, "--grace-s", "0.05", "--log-format", "json")
-    with process(str(HERE / "gated_server.py"), str(gate), *arguments) as running:
-        target, _, _ = ready_line(running)
-        with Robot(target) as robot:
-            call = robot.send(message())
-            with model_at(gate):
-                running.send_signal(signal.SIGTERM)
-                code, stderr = end(running)
-            assert call.exception(PATIENCE_S).code() is grpc.StatusCode.UNAVAILABLE
-    assert code == 1
-    events = [json.loads(line) for line in stderr.splitlines() if line.startswith("{")]
+def serve_here(
+    monkeypatch: pytest.MonkeyPatch,
+    cloud: StubCloud,
+    operator: Callable[[Robot], None],
+    *arguments: str,
+) -> int:
+    """Runs ``serve`` in this process until ``operator`` has returned; returns the exit code."""
+    monkeypatch.setattr(serve_command, "load_engine", lambda *_: Engine(cloud))
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+
+    def operate() -> None:
+        try:
+            operator(robot)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with Robot(f"127.0.0.1:{port}") as robot, ThreadPoolExecutor(1) as pool:
+        operating = pool.submit(operate)
+        code = cli.main(["serve", "--port", port, "--admin-port", "0", *arguments])
+        operating.result()
+    return code
+
+
+@pytest.mark.usefixtures("logging_as_it_was")
+def test_calls_that_outlast_the_grace_are_an_exit_code(
+    monkeypatch: pytest.MonkeyPatch, cloud: StubCloud, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = []
+
+    def operator(robot: Robot) -> None:
+        eventually(lambda: health_of(robot) == SERVING)
+        cloud.forget()
+        cloud.hold()
+        calls.append(robot.send(message()))
+        cloud.wait_until_running()
+
+    arguments = ("--grace-s", "0.05", "--log-format", "json")
+    assert serve_here(monkeypatch, cloud, operator, *arguments) == 1
+    assert calls[0].exception(PATIENCE_S).code() is grpc.StatusCode.UNAVAILABLE
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert any("cut off" in event["message"] for event in events)
 
 
-def test_a_signal_while_the_model_loads_ends_the_process(tmp_path: Path) -> None:
-    """The warm-up of the second batch size waits at the gate for ever."""
-    gate = tmp_path / "gate"
-    os.mkfifo(gate)
-    script = (
-        "import sys, server_stubs, gated_server as g\n"
-        "from comvla_server import cli, serve_command\n"
-        f"cloud = g.GatedCloud({str(gate)!r})\n"
-        "serve_command.load_engine = lambda *_: g.Engine(cloud)\n"
-        "sys.exit(cli.main(['serve', '--port', '0', '--admin-port', '0']))\n"
-    )
-    with process("-c", script) as running, model_at(gate):
-        running.send_signal(signal.SIGTERM)
-        code, stderr = end(running)
-    assert code == 0
+@pytest.mark.usefixtures("logging_as_it_was")
+def test_a_signal_while_the_model_loads_ends_the_process(
+    monkeypatch: pytest.MonkeyPatch, cloud: StubCloud, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud.hold()
+    assert serve_here(monkeypatch, cloud, lambda _: cloud.wait_until_running()) == 0
+    stdout, stderr = capsys.readouterr()
+    assert "ready" not in stdout
     assert "Traceback" not in stderr
 
 
-def test_the_real_command_serves_a_checkpoint(checkpoint: Path) -> None:
+def test_the_real_command_serves_a_checkpoint_until_ctrl_c(checkpoint: Path) -> None:
     _, cloud = random_policy(seed=0)
     arguments = ("-m", "comvla_server", "serve", "--model", str(checkpoint), *FREE_PORTS)
     with process(*arguments, "--threads", "1", "--log-format", "json") as running:
@@ -179,24 +210,27 @@ def test_the_real_command_serves_a_checkpoint(checkpoint: Path) -> None:
         with Robot(target) as robot:
             assert len(robot.infer(request).actions) == 8 * 4
         assert httpx.get(f"{admin}/v1/model").json()["fingerprint"] == cloud.info.fingerprint
-        running.send_signal(signal.SIGTERM)
+        running.send_signal(signal.SIGINT)
         code, stderr = end(running)
     assert code == 0
     assert all(json.loads(line)["level"] for line in stderr.splitlines())
 
 
-def test_a_taken_port_is_exit_code_two_and_one_clear_line() -> None:
+@pytest.mark.usefixtures("logging_as_it_was")
+def test_a_taken_port_is_exit_code_two_and_one_clear_line(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        arguments = ("-m", "comvla_server", "serve", "--port", port, "--admin-port", "0")
-        with process(*arguments) as running:
-            code, stderr = end(running)
-    assert code == 2
+        assert cli.main(["serve", "--port", port, "--admin-port", "0"]) == 2
+    stdout, stderr = capfd.readouterr()
+    assert stdout == ""
     assert f"cannot listen on 127.0.0.1:{port}" in stderr
     assert "choose another --port" in stderr
     assert len(stderr.splitlines()) == 1
 
 
+@pytest.mark.usefixtures("logging_as_it_was")
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -8,8 +8,10 @@ import time
 
 from server_stubs import PATIENCE_S, StubCloud
 
+from comvla_client.channel import CHANNEL_OPTIONS
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
+from comvla_server.grpc_adapter import server_options
 from comvla_server.settings import ServerSettings
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
@@ -75,3 +77,12 @@ def test_pings_at_the_agreed_pace_are_answered_without_any_call() -> None:
 
 def test_a_flood_of_pings_ends_the_connection() -> None:
     assert goodbye_after(pings=20, pause_s=0.0, settings=ServerSettings()) == b"too_many_pings"
+
+
+def test_clients_ping_at_half_the_pace_at_which_the_server_hangs_up() -> None:
+    server = dict(server_options(ServerSettings()))
+    client = dict(CHANNEL_OPTIONS)
+    shortest_ms = server["grpc.http2.min_ping_interval_without_data_ms"]
+    assert client["grpc.keepalive_time_ms"] >= 2 * shortest_ms
+    assert client["grpc.keepalive_permit_without_calls"] == 1
+    assert server["grpc.keepalive_permit_without_calls"] == 1

@@ -20,7 +20,7 @@ from comvla.errors import CheckpointError
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
-from comvla_server.grpc_adapter import SERVICE_NAME, server_options
+from comvla_server.grpc_adapter import SERVICE_NAME
 from comvla_server.lifecycle import Lifecycle, Phase
 from comvla_server.ports import BindError, authority
 from comvla_server.server import Server
@@ -149,7 +149,8 @@ def test_calls_that_outlast_the_grace_are_cut_off_with_words(
     assert "stopped before step 0 was computed" in words
 
 
-def test_stopping_twice_is_harmless(cloud: StubCloud) -> None:
+def test_stopping_twice_or_before_the_start_is_harmless(cloud: StubCloud) -> None:
+    assert BackgroundServer(Engine(cloud)).stop()
     server = BackgroundServer(Engine(cloud)).start()
     assert server.stop()
     assert server.stop()
@@ -240,14 +241,6 @@ def test_reflection_lists_and_describes_the_service(robot: Robot) -> None:
     names = {service.name for service in listed.list_services_response.service}
     assert {SERVICE_NAME, "grpc.health.v1.Health"} <= names
     assert described.file_descriptor_response.file_descriptor_proto
-
-
-def test_a_client_that_pings_as_agreed_keeps_its_connection() -> None:
-    """Clients ping every 10 s, without calls too; the default of gRPC would send GOAWAY."""
-    options = dict(server_options(ServerSettings()))
-    assert options["grpc.keepalive_permit_without_calls"] == 1
-    for name in ("min_ping_interval_without_data_ms", "min_recv_ping_interval_without_data_ms"):
-        assert options[f"grpc.http2.{name}"] <= 10_000 / 2
 
 
 def test_phases_only_go_forward() -> None:

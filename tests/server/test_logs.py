@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-from collections.abc import Iterator
 
 import pytest
 
@@ -15,15 +14,7 @@ from comvla_server.log_throttle import LogThrottle
 EVIL = "a\nERROR forged \x1b[31m\u2028line"
 
 
-@pytest.fixture(autouse=True)
-def _restore_root_logger() -> Iterator[None]:
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    uvicorn_level = logging.getLogger("uvicorn").level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    logging.getLogger("uvicorn").setLevel(uvicorn_level)
+pytestmark = pytest.mark.usefixtures("logging_as_it_was")
 
 
 def test_json_lines_carry_the_event_and_its_fields() -> None:

@@ -188,6 +188,19 @@ def test_overload_is_refused_at_once_and_passes(cloud: StubCloud) -> None:
         assert robot.infer(message("later"))
 
 
+def test_more_calls_than_the_server_may_hold_are_refused_by_grpc(cloud: StubCloud) -> None:
+    settings = ServerSettings(max_concurrent_calls=2)
+    with BackgroundServer(Engine(cloud), settings) as server, Robot(server.target) as robot:
+        cloud.forget()
+        cloud.hold()
+        calls = [robot.send(message("a")), robot.send(message("b"))]
+        cloud.wait_until_running()
+        eventually(lambda: depth(server) == 1)
+        assert robot.refused(message("c"))[0] is grpc.StatusCode.RESOURCE_EXHAUSTED
+        cloud.release()
+        assert all(call.result() for call in calls)
+
+
 def test_a_failing_model_is_internal_to_its_requests_only(
     robot: Robot, cloud: StubCloud, caplog: pytest.LogCaptureFixture
 ) -> None:

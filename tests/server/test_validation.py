@@ -140,9 +140,11 @@ def test_an_unknown_quantization_is_refused() -> None:
 def test_a_model_without_proprioception_takes_none() -> None:
     info = dataclasses.replace(STUB_INFO, proprio_dim=0)
     validator = Validator(Engine(StubCloud(info)), max_request_bytes=4096)
-    assert validator.read(message(proprio=[])).proprio is None
+    without = message(proprio=[])
+    validator.check_identity(without)
+    assert validator.read(without).proprio is None
     with pytest.raises(Refusal, match="expected no proprioception, got 1 values"):
-        validator.read(message(proprio=[0.5]))
+        validator.check_identity(message(proprio=[0.5]))
 
 
 def test_a_missing_link_report_is_fine() -> None:
