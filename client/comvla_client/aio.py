@@ -62,7 +62,6 @@ class AsyncComVLAClient:
             session_id=session_id,
             seed=seed,
         )
-        self._target = str(target)
         self._connect_timeout_s = connect_timeout_s
         self._lock = asyncio.Lock()
         self._connected = False
@@ -94,7 +93,8 @@ class AsyncComVLAClient:
             self._core.accept_server(response)
         except TransportError as error:
             await self.close()
-            raise channel.no_server(self._target, error, self._connect_timeout_s) from error
+            target = channel.target_of(self._transport)
+            raise channel.no_server(target, error, self._connect_timeout_s) from error
         except BaseException:
             await self.close()
             raise
@@ -147,10 +147,21 @@ class AsyncComVLAClient:
         self, obs: Observation, instr: str, snr: float | SnrReading | None
     ) -> ActionChunk:
         await self.connect()
-        prepared = await asyncio.to_thread(self._core.prepare, obs, instr, snr)
+        prepared = await self._prepare(obs, instr, snr)
         if prepared.request is None:
             return self._core.fail(prepared)
         return await self._call(prepared)
+
+    async def _prepare(
+        self, obs: Observation, instr: str, snr: float | SnrReading | None
+    ) -> Prepared:
+        work = asyncio.ensure_future(asyncio.to_thread(self._core.prepare, obs, instr, snr))
+        try:
+            return await asyncio.shield(work)
+        except asyncio.CancelledError:
+            # A thread cannot be cancelled, and the next step must not meet it in the edge model.
+            await asyncio.wait([work])
+            raise
 
     async def _call(self, prepared: Prepared) -> ActionChunk:
         assert prepared.request is not None

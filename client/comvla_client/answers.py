@@ -28,6 +28,8 @@ _FALLBACKS: dict[str, FallbackReason] = {
     "CANCELLED": "rejected",
     "DATA_LOSS": "rejected",
 }
+# gRPC's words and the server's for a message that is too large, which no waiting makes smaller.
+_OVERSIZE = ("larger than max", "request of at most")
 # The server's words for what it could not accept, most telling first.
 _INVALID: tuple[tuple[str, type[ComVLAError]], ...] = (
     ("propriocep", ObservationError),
@@ -48,7 +50,7 @@ def fallback_reason(error: TransportError) -> FallbackReason:
             can succeed, so holding would be for ever.
         ObservationError, InstructionError, CodecError: the server found the request invalid.
     """
-    if "larger than max" in error.message:
+    if any(words in error.message for words in _OVERSIZE):
         raise HandshakeError(
             f"the message cap on the way to the server is too small ({error.message}): raise it on "
             "the server, send fewer tokens, or use a coarser quantization"

@@ -54,6 +54,11 @@ def check_target(target: str) -> str:
     return target
 
 
+def target_of(transport: object) -> str:
+    """The address that a transport calls, or at least what it is."""
+    return str(getattr(transport, "target", type(transport).__name__))
+
+
 class Attempts:
     """The attempts of one call: when to try again, and which failure to tell in the end.
 

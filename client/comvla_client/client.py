@@ -96,7 +96,7 @@ class ComVLAClient:
         self._closed = False
         self._transport = GrpcTransport(target) if isinstance(target, str) else target
         try:
-            self._shake_hands(str(target), connect_timeout_s)
+            self._shake_hands(connect_timeout_s)
         except BaseException:
             self.close()
             raise
@@ -184,10 +184,11 @@ class ComVLAClient:
     ) -> None:
         self.close()
 
-    def _shake_hands(self, target: str, connect_timeout_s: float) -> None:
+    def _shake_hands(self, connect_timeout_s: float) -> None:
         try:
             response = self._transport.get_model(connect_timeout_s)
         except TransportError as error:
+            target = channel.target_of(self._transport)
             raise channel.no_server(target, error, connect_timeout_s) from error
         self._core.accept_server(response)
 

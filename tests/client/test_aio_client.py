@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from dataclasses import replace
 from typing import Any
@@ -182,6 +183,32 @@ async def test_a_cancelled_step_is_cancelled_and_the_client_lives_on() -> None:
                 await step
             service.before = None
             assert (await client.step(OBS, WORDS)).source == "cloud"
+
+
+async def test_a_step_cancelled_while_it_encodes_does_not_meet_the_next_one() -> None:
+    encoding, go_on = threading.Event(), threading.Event()
+
+    class SlowEdge(StubEdge):
+        busy = 0
+
+        def encode(self, images: Any) -> Any:
+            self.busy += 1
+            assert self.busy == 1, "two steps in one edge model"
+            encoding.set()
+            assert go_on.wait(10.0)
+            self.busy -= 1
+            return super().encode(images)
+
+    async with aio_client_of(AsyncStubTransport(), edge=SlowEdge()) as client:
+        first = asyncio.create_task(client.step(OBS, WORDS))
+        await asyncio.to_thread(encoding.wait)
+        first.cancel()
+        second = asyncio.create_task(client.step(OBS, WORDS))
+        await asyncio.sleep(0)
+        go_on.set()
+        with pytest.raises(asyncio.CancelledError):
+            await first
+        assert (await second).source == "cloud"
 
 
 async def test_no_server_names_host_budget_and_remedy() -> None:

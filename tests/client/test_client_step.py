@@ -324,6 +324,7 @@ def test_a_robot_that_restarts_is_not_taken_for_its_former_self() -> None:
         ("UNIMPLEMENTED", "no such method", HandshakeError),
         ("UNAUTHENTICATED", "who are you", HandshakeError),
         ("RESOURCE_EXHAUSTED", "Received message larger than max (9 vs. 4)", HandshakeError),
+        ("RESOURCE_EXHAUSTED", "expected a request of at most 9 bytes, got 10", HandshakeError),
     ],
 )
 def test_what_no_later_step_can_mend_raises_in_the_servers_words(
@@ -470,6 +471,13 @@ def test_a_closed_client_says_so() -> None:
     for use in (lambda: client.step(OBS, WORDS), lambda: client.act(OBS, WORDS), client.reset):
         with pytest.raises(ClientClosedError, match="closed"):
             use()
+
+
+def test_a_transport_of_ones_own_that_finds_no_server_is_named() -> None:
+    transport = StubTransport(model=fault("UNAVAILABLE", "cable out"))
+    with pytest.raises(HandshakeError, match=r"StubTransport within 5 s.*cable out"):
+        client_of(transport)
+    assert transport.closed
 
 
 def test_the_client_tells_its_model() -> None:
