@@ -118,7 +118,8 @@ NIBBLES = codec.encode(tokens(3, 7), [7, 0, 400], "int4")  # header 14, record 1
         (changed(PAYLOAD, 6, "B", 17), "1 to 16 vision towers"),
         (changed(PAYLOAD, 7, "B", 1), "zero byte"),
         (changed(PAYLOAD, 8, "H", 9), r"sum to token_dim 9, got \[3, 5\]"),
-        (changed(PAYLOAD, 12, "H", 0), r"got \[0, 5\]"),
+        (changed(PAYLOAD, 12, "H", 4), r"sum to token_dim 8, got \[4, 5\]"),
+        (changed(changed(PAYLOAD, 12, "H", 0), 14, "H", 8), r"above 0 .* got \[0, 8\]"),
         (changed(PAYLOAD, 10, "H", 2), "2 tokens of 18 bytes each, got 18 bytes more"),
         (PAYLOAD + b"\0", "got 1 bytes more"),
         (changed(PAYLOAD, 16, "H", 65_535), "positions from 0 to 65534, got 65535"),
@@ -139,6 +140,7 @@ NIBBLES = codec.encode(tokens(3, 7), [7, 0, 400], "int4")  # header 14, record 1
         (np.frombuffer(PAYLOAD, np.uint8), "bytes, got ndarray"),
         (memoryview(PAYLOAD + PAYLOAD)[::2], "contiguous"),
     ],
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
 def test_decode_refuses_what_encode_does_not_write(payload: Any, words: str) -> None:
     with pytest.raises(CodecError, match=words):
