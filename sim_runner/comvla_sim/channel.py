@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+
 from comvla.errors import LinkError
 
 BLOCK_PERIODS = 256

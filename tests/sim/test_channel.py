@@ -8,6 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
 from comvla.errors import LinkError
 from comvla_sim.channel import (
     BLOCK_PERIODS,
@@ -17,9 +21,6 @@ from comvla_sim.channel import (
     TraceChannel,
     bessel_j0,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 PERIOD_S = 0.05
 REALISATIONS = 2000

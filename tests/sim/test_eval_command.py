@@ -107,7 +107,7 @@ def test_ctrl_c_leaves_a_file_that_the_same_command_completes(
     assert str(out) in capsys.readouterr().err
     assert evaluate(out, *options) == 0
     assert [line["episode"] for line in read(out)] == [0, 1]
-    assert "Success over all instructions" in capsys.readouterr().out
+    assert "success over all instructions" in capsys.readouterr().out
 
 
 def test_two_processes_and_a_real_server_measure_the_same_as_one_process(

@@ -122,5 +122,5 @@ def test_the_terminal_shows_what_the_json_says() -> None:
     text = screen.getvalue()
     assert "hard_voting 16" in text
     assert "8/10" in text
-    assert "wrong_instruction: hard_voting 16" in text
+    assert "wrong_instruction: by task" in text
     assert "McNemar" in text

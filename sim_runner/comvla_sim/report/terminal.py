@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
 _MAX_COMPARISONS = 12
+
+Line = dict[str, Any]
 
 
 def percent(value: float | None) -> str:
@@ -15,77 +19,98 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{100 * value:.1f}"
 
 
-def entry_name(entry: dict[str, Any]) -> str:
+def entry_name(entry: Line) -> str:
     """Condition, method and K in a few words; the normal condition goes without saying."""
     method = "full" if entry["method"] == "full" else f"{entry['method']} {entry['k']}"
     return method if entry["condition"] == "normal" else f"{entry['condition']}: {method}"
 
 
 def print_summary(summary: dict[str, Any], console: Console | None = None) -> None:
-    """Prints aggregate, successes by instruction, and the paired tests.
+    """Prints successes over all tasks and by task for each condition, and the paired tests.
 
     Args:
         summary: of :func:`comvla_sim.experiments.summary.summarise`.
         console: standard output by default.
     """
     console = console or Console()
-    console.print(_aggregate(summary["aggregate"]))
-    console.print(_by_task(summary["rows"]))
-    if summary["comparisons"]:
-        console.print(_comparisons(summary["comparisons"]))
-        hidden = len(summary["comparisons"]) - _MAX_COMPARISONS
-        if hidden > 0:
-            console.print(f"and {hidden} more pairs: --json, or comvla-sim report, shows all")
+    for condition in dict.fromkeys(line["condition"] for line in summary["aggregate"]):
+        lines = [line for line in summary["aggregate"] if line["condition"] == condition]
+        console.print(_over_all_tasks(condition, lines))
+        lines = [line for line in summary["rows"] if line["condition"] == condition]
+        console.print(_by_task(condition, lines))
+    console.print(
+        "bytes: on the wire per query; votes: distinct tokens that got one; hit: the named object's "
+        "token was sent.",
+        style="dim",
+    )
+    _print_comparisons(summary["comparisons"], console)
 
 
-def _table(title: str, *names: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for name in names:
-        table.add_column(name)
+def _table(title: str, texts: Sequence[str], numbers: Sequence[str]) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in texts:
+        table.add_column(name, overflow="fold", min_width=11)
+    for name in numbers:
+        table.add_column(name, justify="right")
     return table
 
 
-def _aggregate(lines: list[dict[str, Any]]) -> Table:
-    table = _table("Success over all instructions (95 % Wilson intervals)", "method, K")
-    for name in ("success", "%", "interval", "other %", "bytes/query", "votes", "hit %"):
-        table.add_column(name, justify="right", no_wrap=True)
+def _over_all_tasks(condition: str, lines: Sequence[Line]) -> Table:
+    names = ["K", "success", "%", "95 % interval", "bytes", "votes", "hit %"]
+    misled = any(line["other"] for line in lines)
+    if misled:
+        names.append("other task %")
+    table = _table(f"{condition}: success over all instructions", ["method"], names)
     for line in lines:
         other, selection = line["other"], line["selection"]
         votes = selection["distinct_votes"]
-        table.add_row(
-            entry_name(line),
+        cells = [
+            line["method"],
+            str(line["k"]),
             f"{line['successes']}/{line['episodes']}",
             percent(line["success_rate"]),
             f"{percent(line['low'])}–{percent(line['high'])}",
-            percent(other["successes"] / other["episodes"]) if other else "–",
             f"{line['framed_bytes_per_query']:.0f}",
             "–" if votes is None else f"{votes:.1f}",
             percent(selection["object_hit_rate"]),
-        )
+        ]
+        if misled:
+            cells.append(percent(other["successes"] / other["episodes"]) if other else "–")
+        table.add_row(*cells)
     return table
 
 
-def _by_task(lines: list[dict[str, Any]]) -> Table:
-    entries = list(dict.fromkeys(entry_name(line) for line in lines))
+def _by_task(condition: str, lines: Sequence[Line]) -> Table:
     tasks = list(dict.fromkeys(line["task"] for line in lines))
     cells = {
-        (entry_name(line), line["task"]): f"{line['successes']}/{line['episodes']}"
+        (line["method"], line["k"], line["task"]): f"{line['successes']}/{line['episodes']}"
         for line in lines
     }
-    table = _table("Successes by task", "method, K")
-    for task in tasks:
-        table.add_column(task, justify="right")
-    for entry in entries:
-        table.add_row(entry, *(cells.get((entry, task), "–") for task in tasks))
+    # Names such as drawer-open over two lines: eight of them fit on a terminal.
+    heads = ["K", *(task.replace("-", "\n") for task in tasks)]
+    table = _table(f"{condition}: by task", ["method"], heads)
+    for method, k in dict.fromkeys((line["method"], line["k"]) for line in lines):
+        row = (cells.get((method, k, task), "–") for task in tasks)
+        table.add_row(method, str(k), *row)
     return table
 
 
-def _comparisons(lines: list[dict[str, Any]]) -> Table:
-    table = _table("Paired episodes, exact McNemar test", "first", "second")
-    for name in ("pairs", "only first", "only second", "p"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for line in sorted(lines, key=lambda line: float(line["p_value"]))[:_MAX_COMPARISONS]:
+def _print_comparisons(lines: Sequence[Line], console: Console) -> None:
+    """Methods against methods; what conditions do needs no test and is in the JSON."""
+    between = [line for line in lines if line["first"]["condition"] == line["second"]["condition"]]
+    between = [line for line in between if line["first"]["condition"] == "normal"]
+    if not between:
+        return
+    table = _table(
+        "Paired episodes, exact McNemar test",
+        ["first", "second"],
+        ["pairs", "only first", "only second", "p"],
+    )
+    for line in sorted(between, key=lambda line: float(line["p_value"]))[:_MAX_COMPARISONS]:
         names = (entry_name(line["first"]), entry_name(line["second"]))
         counts = (str(line[key]) for key in ("pairs", "only_first", "only_second"))
         table.add_row(*names, *counts, f"{line['p_value']:.2g}")
-    return table
+    console.print(table)
+    hidden = len(lines) - min(len(between), _MAX_COMPARISONS)
+    if hidden > 0:
+        console.print(f"and {hidden} more pairs: --json, or comvla-sim report, shows all")
