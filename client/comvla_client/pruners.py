@@ -151,9 +151,10 @@ class MotionGate:
 
 
 def view_quotas(kept: int, shares: tuple[float, ...]) -> list[int]:
-    """How many of ``kept`` tokens each view may keep: rounded shares, and the last view gets the rest."""
-    quotas = [round(kept * share) for share in shares[:-1]]
-    return [*quotas, kept - sum(quotas)]
+    """How many of ``kept`` tokens each view may keep: rounded shares; the largest takes what rounding left over."""
+    quotas = [max(1, round(kept * share)) for share in shares]
+    quotas[shares.index(max(shares))] += kept - sum(quotas)
+    return quotas
 
 
 def _robot(context: ScoringContext, name: str) -> tuple[PruningEdge, str, NumpyArray]:

@@ -74,6 +74,7 @@ def describe(source: str, tokenizer: str | None = None) -> dict[str, Any]:
         CheckpointError: missing, damaged, foreign or incomplete.
     """
     import torch
+
     from comvla_vla.checkpoints import model_info, open_checkpoint
     from comvla_vla.checkpoints.accounting import HALVES, half_size
 

@@ -24,10 +24,12 @@ from comvla_vla.checkpoints.published import MODEL_TYPE, Recipe, published_confi
 from comvla_vla.checkpoints.shards import INDEX, WEIGHTS, open_weights
 from comvla_vla.checkpoints.tensors import TensorEntry, check_shapes
 
-Part: TypeAlias = Literal["whole", "edge", "cloud"]
+Part: TypeAlias = Literal["whole", "edge", "cloud", "any"]
+"""What a checkpoint is needed for; ``"any"`` takes whatever it holds."""
 
 _SIDE_FILES: dict[Part, list[str]] = {
     "whole": ["*--*checkpoint*.pt"],
+    "any": ["*--*checkpoint*.pt"],
     "edge": ["vision_backbone--*", "proprio_projector--*"],
     "cloud": ["action_head--*", "proprio_projector--*", "noisy_action_projector--*"],
 }
@@ -74,7 +76,7 @@ def open_checkpoint(
         raise CheckpointError(
             f"{path} is {came!r}, this version reads {FORMAT!r} and published {MODEL_TYPE!r} checkpoints"
         )
-    if checkpoint.half not in ("whole", part):
+    if part != "any" and checkpoint.half not in ("whole", part):
         raise CheckpointError(
             f"{folder} holds the {checkpoint.half} half, the {part} half was asked for"
             if part != "whole"
@@ -105,7 +107,7 @@ def _locate(source: str | Path, part: Part) -> tuple[Path, Half | None]:
     name = str(source)
     if name == "mini" or Path(name).expanduser().exists() or not hub.looks_like_repository(name):
         return locate(source), None
-    half = None if part == "whole" else part
+    half = part if part in ("edge", "cloud") else None
     return hub.fetch(name, _wanted(half), _SIDE_FILES[part]), half
 
 

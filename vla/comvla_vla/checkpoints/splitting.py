@@ -8,15 +8,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from comvla.errors import CheckpointError
 from comvla_vla.checkpoints.accounting import HALVES, Half, half_shapes
 from comvla_vla.checkpoints.identity import combine, tensor_digest
 from comvla_vla.checkpoints.memory import check_disk, gigabytes
 from comvla_vla.checkpoints.native import WEIGHTS, publish, write_around
 from comvla_vla.checkpoints.opened import Checkpoint
-from comvla_vla.checkpoints.opening import Part, open_checkpoint
+from comvla_vla.checkpoints.opening import open_checkpoint
 from comvla_vla.checkpoints.published import Recipe
 from comvla_vla.checkpoints.safetensors_writer import SafetensorsWriter, file_order
 from comvla_vla.checkpoints.tensors import check_shapes, total_bytes
@@ -152,9 +150,8 @@ def describe(report: SplitReport) -> str:
     )
 
 
-def _part(checkpoint: Checkpoint, half: Part) -> Checkpoint:
+def _part(checkpoint: Checkpoint, half: Half) -> Checkpoint:
     """The same checkpoint with one half's tensors only."""
-    assert half != "whole"
     names = half_shapes(half, checkpoint.config)
     check_shapes(checkpoint.tensors, names, checkpoint.where, exhaustive=False)
     return Checkpoint(
@@ -210,11 +207,3 @@ def _report(checkpoint: Checkpoint, parts: dict[Half, Checkpoint], digest: str) 
         shared_bytes=total_bytes(shared),
         left_out=len(set(checkpoint.tensors) - set(edge) - set(cloud)),
     )
-
-
-def bytes_needed(checkpoint: Checkpoint, half: Half, dtype: torch.dtype | None = None) -> int:
-    """Disk of one half as stored, or its memory in another number format."""
-    entries = _part(checkpoint, half).tensors.values()
-    if dtype is None:
-        return total_bytes(entries)
-    return sum(entry.nbytes // entry.dtype.itemsize * dtype.itemsize for entry in entries)
