@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import grpc
@@ -118,6 +119,15 @@ def policy_request(name: float = 0.0, k: int = 3) -> PolicyRequest:
     )
 
 
+@lru_cache
+def payload(k: int, quantization: str, info: ModelInfo) -> bytes:
+    """K random tokens at random positions."""
+    rng = np.random.default_rng(k)
+    tokens = rng.normal(size=(k, info.token_dim)).astype(np.float32)
+    positions = rng.permutation(info.num_tokens)[:k]
+    return codec.encode(tokens, positions, quantization, tower_dims=info.tower_dims)
+
+
 def message(
     session: str = "robot",
     step: int = 0,
@@ -129,15 +139,12 @@ def message(
     **changes: Any,
 ) -> policy_pb2.InferRequest:
     """A valid InferRequest, with some fields changed."""
-    rng = np.random.default_rng(k)
-    tokens = rng.normal(size=(k, info.token_dim)).astype(np.float32)
-    positions = rng.permutation(info.num_tokens)[:k]
     fields: dict[str, Any] = {
         "session_id": session,
         "step": step,
         "instruction": "open it",
         "proprio": [name] + [0.0] * (info.proprio_dim - 1),
-        "payload": codec.encode(tokens, positions, quantization, tower_dims=info.tower_dims),
+        "payload": payload(k, quantization, info),
         "model_fingerprint": info.fingerprint,
         "snr_db": 12.5,
         "snr_age_s": 0.01,

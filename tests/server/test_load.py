@@ -21,7 +21,7 @@ from comvla_server.validation import Validator
 from comvla_vla import random_policy
 
 ROBOTS = 16
-STEPS = 12
+STEPS = 6
 MIXED_K = (512, 64, 32, 32, 16, 16, 8, 4)
 INSTRUCTIONS = ("pull the green drawer open", "lower the black lever gently")
 
