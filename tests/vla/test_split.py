@@ -70,8 +70,10 @@ def test_a_batch_of_mixed_sizes_equals_single_requests(policy, observation):
             (16, INSTRUCTIONS[0], 1),
             (512, INSTRUCTIONS[1], 0.5),
             (16, INSTRUCTIONS[2], 0.1),
+            (3, INSTRUCTIONS[0], 0.2),
+            (200, INSTRUCTIONS[0], 0.7),
+            (16, INSTRUCTIONS[0], 0.9),
         ]
-        + [(3, INSTRUCTIONS[0], 0.2), (200, INSTRUCTIONS[0], 0.7), (16, INSTRUCTIONS[0], 0.9)]
     ]
     together = policy[1].predict(requests)
     for request, answer in zip(requests, together, strict=True):
