@@ -77,6 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ComVLAError as error:
         print(f"comvla-sim: {error}", file=sys.stderr)
         return USAGE_ERROR
+    except ModuleNotFoundError as error:
+        print(f"comvla-sim: {error.name} is missing: pip install 'comvla[sim]'", file=sys.stderr)
+        return USAGE_ERROR
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:

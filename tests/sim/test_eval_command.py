@@ -110,6 +110,7 @@ def test_ctrl_c_leaves_a_file_that_the_same_command_completes(
     assert "success over all instructions" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_processes_and_a_real_server_measure_the_same_as_one_process(
     tmp_path: Path,
 ) -> None:

@@ -120,7 +120,7 @@ def test_the_terminal_shows_what_the_json_says() -> None:
     screen = io.StringIO()
     print_summary(summarise(rows()), Console(width=200, file=screen))
     text = screen.getvalue()
-    assert "hard_voting 16" in text
-    assert "8/10" in text
-    assert "wrong_instruction: by task" in text
+    assert re.search(r"hard_voting +16 +8/10 +80\.0 ", text)
+    assert re.search(r"hard_voting +16 +4 +4\b", text)
+    assert "wrong_instruction: successes" in text
     assert "McNemar" in text

@@ -42,9 +42,15 @@ def test_a_missing_module_names_itself_and_blocks_nobody_else(
 
 
 @pytest.mark.parametrize(
-    ("error", "code"), [(LinkError("no such link"), 2), (KeyboardInterrupt(), 130)]
+    ("error", "code"),
+    [
+        (LinkError("no such link"), 2),
+        (ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib"), 2),
+        (KeyboardInterrupt(), 130),
+        (BrokenPipeError(), 1),
+    ],
 )
-def test_typed_errors_are_messages(
+def test_errors_that_a_user_can_mend_are_messages(
     error: BaseException,
     code: int,
     monkeypatch: pytest.MonkeyPatch,

@@ -35,9 +35,10 @@ def print_summary(summary: dict[str, Any], console: Console | None = None) -> No
     console = console or Console()
     for condition in dict.fromkeys(line["condition"] for line in summary["aggregate"]):
         lines = [line for line in summary["aggregate"] if line["condition"] == condition]
-        console.print(_over_all_tasks(condition, lines))
+        console.print(f"{condition}: success over all instructions", style="bold")
+        console.print(_over_all_tasks(lines))
         lines = [line for line in summary["rows"] if line["condition"] == condition]
-        console.print(_by_task(condition, lines))
+        _print_by_task(condition, lines, console)
     console.print(
         "bytes: on the wire per query; votes: distinct tokens that got one; hit: the named object's "
         "token was sent.",
@@ -46,8 +47,8 @@ def print_summary(summary: dict[str, Any], console: Console | None = None) -> No
     _print_comparisons(summary["comparisons"], console)
 
 
-def _table(title: str, texts: Sequence[str], numbers: Sequence[str]) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+def _table(texts: Sequence[str], numbers: Sequence[str]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in texts:
         table.add_column(name, overflow="fold", min_width=11)
     for name in numbers:
@@ -55,12 +56,12 @@ def _table(title: str, texts: Sequence[str], numbers: Sequence[str]) -> Table:
     return table
 
 
-def _over_all_tasks(condition: str, lines: Sequence[Line]) -> Table:
+def _over_all_tasks(lines: Sequence[Line]) -> Table:
     names = ["K", "success", "%", "95 % interval", "bytes", "votes", "hit %"]
     misled = any(line["other"] for line in lines)
     if misled:
-        names.append("other task %")
-    table = _table(f"{condition}: success over all instructions", ["method"], names)
+        names.append("other %")
+    table = _table(["method"], names)
     for line in lines:
         other, selection = line["other"], line["selection"]
         votes = selection["distinct_votes"]
@@ -80,19 +81,25 @@ def _over_all_tasks(condition: str, lines: Sequence[Line]) -> Table:
     return table
 
 
-def _by_task(condition: str, lines: Sequence[Line]) -> Table:
+def _print_by_task(condition: str, lines: Sequence[Line], console: Console) -> None:
     tasks = list(dict.fromkeys(line["task"] for line in lines))
+    counts = {line["episodes"] for line in lines}
+    equal = len(counts) == 1
+    title = f"{condition}: successes by task" + (f", of {min(counts)}" if equal else "")
     cells = {
-        (line["method"], line["k"], line["task"]): f"{line['successes']}/{line['episodes']}"
+        (line["method"], line["k"], line["task"]): str(line["successes"])
+        if equal
+        else f"{line['successes']}/{line['episodes']}"
         for line in lines
     }
     # Names such as drawer-open over two lines: eight of them fit on a terminal.
     heads = ["K", *(task.replace("-", "\n") for task in tasks)]
-    table = _table(f"{condition}: by task", ["method"], heads)
+    table = _table(["method"], heads)
     for method, k in dict.fromkeys((line["method"], line["k"]) for line in lines):
         row = (cells.get((method, k, task), "–") for task in tasks)
         table.add_row(method, str(k), *row)
-    return table
+    console.print(title, style="bold")
+    console.print(table)
 
 
 def _print_comparisons(lines: Sequence[Line], console: Console) -> None:
@@ -101,15 +108,12 @@ def _print_comparisons(lines: Sequence[Line], console: Console) -> None:
     between = [line for line in between if line["first"]["condition"] == "normal"]
     if not between:
         return
-    table = _table(
-        "Paired episodes, exact McNemar test",
-        ["first", "second"],
-        ["pairs", "only first", "only second", "p"],
-    )
+    table = _table(["first", "second"], ["pairs", "only first", "only second", "p"])
     for line in sorted(between, key=lambda line: float(line["p_value"]))[:_MAX_COMPARISONS]:
         names = (entry_name(line["first"]), entry_name(line["second"]))
         counts = (str(line[key]) for key in ("pairs", "only_first", "only_second"))
         table.add_row(*names, *counts, f"{line['p_value']:.2g}")
+    console.print("Paired episodes, exact McNemar test", style="bold")
     console.print(table)
     hidden = len(lines) - min(len(between), _MAX_COMPARISONS)
     if hidden > 0:
