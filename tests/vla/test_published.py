@@ -350,9 +350,9 @@ def test_splitting_needs_far_less_memory_than_the_checkpoint(published, tmp_path
         "import sys\n"
         "from resource import RUSAGE_SELF, getrusage\n"
         "from comvla_vla import split_checkpoint\n"
-        "split_checkpoint(sys.argv[1], sys.argv[3] + '/small')\n"
+        "split_checkpoint(sys.argv[1], sys.argv[3] + '/small_split')\n"
         "before = getrusage(RUSAGE_SELF).ru_maxrss\n"
-        "split_checkpoint(sys.argv[2], sys.argv[3] + '/large')\n"
+        "split_checkpoint(sys.argv[2], sys.argv[3] + '/large_split')\n"
         "print(getrusage(RUSAGE_SELF).ru_maxrss - before)\n"
     )
     done = subprocess.run(
