@@ -21,7 +21,7 @@ from comvla_server.engine import Engine
 from comvla_server.settings import ServerSettings
 from comvla_vla import random_policy
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 INSTRUCTION = "pull the green drawer open"
 SETTINGS = ServerSettings(max_request_bytes=1024 * 1024)
 _NUMBERS = itertools.count()
