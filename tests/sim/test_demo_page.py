@@ -91,6 +91,7 @@ def episode(number: int = 0, instruction: str = "open the drawer", **values: Any
 def page(*episodes: Episode) -> str:
     return render(
         episodes,
+        episodes,
         figures_of(episodes),
         figures_of(episodes, [0.4]),
         link_use(episodes),
@@ -143,6 +144,12 @@ def test_the_headline_counts_successes() -> None:
     assert "<h1>1 of 2 instructions obeyed</h1>" in html
     assert html.count("badge good") == 1
     assert html.count("badge bad") == 1
+
+
+def test_every_episode_stands_beside_its_reference() -> None:
+    html = page(episode(), episode(1, instruction="lower the lever", success=False))
+    (row,) = re.findall(r'<tr><th scope="row">lower the lever</th>(.*?)</tr>', html)
+    assert re.findall(r"<td[^>]*>(.*?)</td>", row) == 2 * ["not done", "10", "7.7 KiB"]
 
 
 def test_figures_are_means_over_requests_and_sums_over_episodes() -> None:

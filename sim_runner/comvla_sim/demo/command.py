@@ -140,6 +140,7 @@ def _play(args: argparse.Namespace, server: ServerProcess) -> dict[str, Any]:
     args.out.write_text(
         render(
             limited,
+            unlimited,
             ours,
             full,
             use,

@@ -21,6 +21,7 @@ _NO_LINK_DB = -60.0
 
 def render(
     episodes: Sequence[Episode],
+    references: Sequence[Episode],
     figures: Figures,
     full: Figures,
     use: LinkUse,
@@ -35,9 +36,9 @@ def render(
 
     Args:
         episodes: with films.
+        references: the same with every token on a link without limit.
         figures: over the fading link.
-        full: of the same episodes with every token on a link without limit; its ``air_s`` is what
-            that would have taken on the fading one.
+        full: of the references; its ``air_s`` is what they would have taken on the fading link.
         use: whether the link's limit was kept.
         info: the model.
         link: the radio.
@@ -55,10 +56,11 @@ def render(
         "POLICY": POLICY,
         "STYLE": shared_style() + _asset("page.css"),
         "HEADLINE": f"{figures.successes} of {figures.episodes} instructions obeyed",
-        "LEAD": _lead(figures, full, info, link, mean_snr_db),
+        "LEAD": _lead(figures, info, link, mean_snr_db),
         "TILES": _tiles(figures, full, use),
         "CARDS": "".join(_card(number, episode) for number, episode in enumerate(episodes)),
         "TABLE": _table(figures, full),
+        "EPISODES": _episodes_table(episodes, references),
         "NOTES": _notes(use, info, link, mean_snr_db, seed),
         "COMMAND": escape(command),
         # "<" would end the script element if a text contained "</script>".
@@ -85,9 +87,7 @@ def _episode(episode: Episode) -> dict[str, Any]:
     }
 
 
-def _lead(
-    figures: Figures, full: Figures, info: ModelInfo, link: LinkProfile, mean_snr_db: float
-) -> str:
+def _lead(figures: Figures, info: ModelInfo, link: LinkProfile, mean_snr_db: float) -> str:
     return (
         f"A simulated arm is driven by <b>{escape(info.name)}</b>, cut in two. The robot’s half "
         f"turns two cameras into {info.num_tokens} tokens, lets the words of the instruction vote, "
@@ -174,6 +174,31 @@ def _table(figures: Figures, full: Figures) -> str:
     head = "<th></th><th scope='col'>voted tokens, fading link</th>"
     head += "<th scope='col'>all tokens, link without limit</th>"
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _episodes_table(episodes: Sequence[Episode], references: Sequence[Episode]) -> str:
+    def cells(episode: Episode) -> str:
+        outcome = ("good", "done") if episode.success else ("bad", "not done")
+        sent = sum(query.report.framed_bytes for query in episode.queries)
+        return (
+            f'<td class="{outcome[0]}">{outcome[1]}</td><td>{episode.periods}</td>'
+            f"<td>{_kib(sent)}</td>"
+        )
+
+    rows = "".join(
+        f'<tr><th scope="row">{escape(episode.scene.task.instruction)}</th>'
+        f"{cells(episode)}{cells(reference)}</tr>"
+        for episode, reference in zip(episodes, references, strict=True)
+    )
+    ways = "".join(
+        f"<th scope='colgroup' colspan='3'>{way}</th>"
+        for way in ("voted tokens, fading link", "all tokens, link without limit")
+    )
+    names = "<th scope='col'>outcome</th><th scope='col'>steps</th><th scope='col'>sent</th>"
+    return (
+        f"<table><thead><tr><th></th>{ways}</tr><tr><th scope='col'>instruction</th>{2 * names}</tr>"
+        f"</thead><tbody>{rows}</tbody></table>"
+    )
 
 
 def _notes(use: LinkUse, info: ModelInfo, link: LinkProfile, mean_snr_db: float, seed: int) -> str:

@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
                     results,
                     shared=subject.settings,
                     story=runner.environment(settings, _command()),
-                    workers=args.workers or os.cpu_count() or 1,
+                    workers=args.workers or _cores(),
                     on_row=on_row,
                 )
         except KeyboardInterrupt:
@@ -162,6 +162,13 @@ def _default_path(settings: EvalSettings, subject: Subject) -> Path:
     model = f"{subject.settings['model']}-{subject.settings['model_fingerprint'][:8]}"
     name = f"{world}-{model}-{settings.quantization}-seed{settings.seed}.jsonl"
     return Path("runs") / "eval" / name
+
+
+def _cores() -> int:
+    """Cores that this process may use, which in a container are fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _command() -> str:
