@@ -207,10 +207,10 @@ def _notes(use: LinkUse, info: ModelInfo, link: LinkProfile, mean_snr_db: float,
         f"{link.bandwidth_hz / 1e6:g} MHz, control period {1000 * link.period_s:g} ms, efficiency "
         f"{link.efficiency:g}. The bandwidth is the paper’s 20 MHz scaled to this model’s small "
         "tokens, so that the number of tokens that fit is the same.",
-        f"Every byte counts: protobuf, gRPC and HTTP/2 framing included, the largest of "
-        f"{use.requests} requests took {100 * use.largest_share:.1f} % of what its period carried. "
-        "The link cuts whatever exceeds the capacity; here nothing did. The robot knows the SNR of "
-        "the period in which it sends.",
+        "Every byte counts, protobuf, gRPC and HTTP/2 framing included: the largest of "
+        f"{use.requests} requests came to {100 * use.largest_share:.1f} % of what its period "
+        f"carried. The link withholds whatever exceeds the capacity; {use.above_capacity} requests "
+        "did. The robot knows the SNR of the period in which it sends.",
         "Time on the air is simulated; computing is measured on the machine that ran the demo, over "
         "a local connection. For all tokens it is the time that their bytes would have needed on "
         "the same fading link.",
