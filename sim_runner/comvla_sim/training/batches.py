@@ -9,14 +9,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from comvla_vla.prompt import Prompt
-from comvla_vla.statistics import Statistics
 from numpy.typing import NDArray
 
 from comvla_sim.training.demonstrations import Demonstrations
 from comvla_sim.training.grounding import query_targets
 from comvla_sim.training.objective import Batch
 from comvla_sim.worlds.base import Task
+from comvla_vla.prompt import Prompt
+from comvla_vla.statistics import Statistics
 
 
 class Sampler:

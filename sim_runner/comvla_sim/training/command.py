@@ -100,15 +100,15 @@ def _demonstrate(data: Path, layouts: int, workers: int) -> None:
 
 def _train(out: Path, data: Path, layouts: int, recipe: Recipe, threads: int) -> dict[str, Any]:
     import torch
-    from comvla_vla import save_policy
-    from comvla_vla.presets import MINI_WORDS, mini
-    from comvla_vla.prompt import Prompt, word_tokenizer
-    from comvla_vla.statistics import pick_statistics
 
     from comvla_sim.training.batches import Sampler
     from comvla_sim.training.demonstrations import Demonstrations
     from comvla_sim.training.trainer import Trainer
     from comvla_sim.worlds.tabletop import Tabletop
+    from comvla_vla import save_policy
+    from comvla_vla.presets import MINI_WORDS, mini
+    from comvla_vla.prompt import Prompt, word_tokenizer
+    from comvla_vla.statistics import pick_statistics
 
     torch.set_num_threads(threads)
     train, held_out = Demonstrations(data / "train"), Demonstrations(data / "validation")

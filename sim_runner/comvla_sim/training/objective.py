@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from comvla_vla.nets import CloudNet, EdgeNet
-from comvla_vla.preprocess import normalise
 from torch import Tensor, nn
 
 from comvla_sim.training.grounding import grounding_targets
+from comvla_vla.nets import CloudNet, EdgeNet
+from comvla_vla.preprocess import normalise
 
 # Centre and scale of the hand, object and goal positions (metres) that the auxiliary head predicts.
 _CENTRE, _SCALE = (0.0, 0.65, 0.15), (0.2, 0.1, 0.08)

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from comvla.errors import ComVLAError
-from comvla_vla.config import ModelConfig
-from comvla_vla.nets import join
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from comvla.errors import ComVLAError
 from comvla_sim.training.batches import Sampler
 from comvla_sim.training.objective import Learner, Weights
+from comvla_vla.config import ModelConfig
+from comvla_vla.nets import join
 
 
 class TrainingError(ComVLAError):
