@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import abc
-import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -13,14 +13,15 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from comvla_sim.worlds.rendering import FAR_CAMERAS, Renderer, load_mujoco, project
-
 Observation = dict[str, npt.NDArray[Any]]
 Info = dict[str, Any]
 StepResult = tuple[Observation, float, bool, bool, Info]
 
 ACTION_DIM = 4
-"""Motion of the hand along x, y, z (1 is one centimetre a step) and the gripper (1 closes)."""
+"""Of Meta-World's arm: motion of the hand along x, y, z (1 is one centimetre a step) and the
+gripper (1 closes)."""
+
+NUM_VIEWS = 2
 
 
 @dataclass(frozen=True)
@@ -53,45 +54,52 @@ class WorldState:
 class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     """A simulated robot before a table, told in words what to do.
 
-    Observations are ``{"images": (2, S, S, 3) uint8 RGB, "proprio": (4,) float32}``, the
-    proprioception being the hand's position (x, y, z) in metres and the gripper's opening in
-    [0, 1]. Actions are (4,) float32 in [-1, 1]. The reward is 1 in the step in which the current
-    task succeeds, which also terminates the episode, else 0.
+    Observations are ``{"images": (2, S, S, 3) uint8 RGB, "proprio": (P,) float32}``. Actions are
+    (A,) float32 in [-1, 1]. The reward is 1 in the step in which the current task succeeds, which
+    also terminates the episode, else 0.
 
-    Subclasses set :attr:`tasks`, :attr:`model` and :attr:`data` and implement the abstract methods.
+    Subclasses set :attr:`tasks` and implement the abstract methods.
 
     Args:
         image_size: side of a picture in pixels.
         render: False saves the drawing: the images of every observation are then black.
+        action_dim: A.
+        proprio_low: (P,) least values of the proprioception.
+        proprio_high: (P,) greatest values.
     """
 
     tasks: tuple[Task, ...]
     control_period_s: float
     max_episode_steps: int
-    model: Any
-    data: Any
+    labels: Mapping[str, str] = MappingProxyType({})
+    """What has to be said with every figure measured here; it goes into info and result rows."""
+    model: Any = None
+    data: Any = None
     observation_space: spaces.Dict  # type: ignore[assignment]
 
-    def __init__(self, *, image_size: int = 128, render: bool = True) -> None:
+    def __init__(
+        self,
+        *,
+        image_size: int,
+        render: bool,
+        action_dim: int,
+        proprio_low: Sequence[float],
+        proprio_high: Sequence[float],
+    ) -> None:
         if image_size < 1:
             raise ValueError(f"image_size must be at least 1 pixel, got {image_size}")
-        # Meta-World's experts say at every step that their output gets clipped. It is meant to be.
-        warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
         self.image_size = image_size
+        self.action_dim = action_dim
+        pictures = (NUM_VIEWS, image_size, image_size, 3)
+        low, high = np.asarray(proprio_low, np.float32), np.asarray(proprio_high, np.float32)
         self.observation_space = spaces.Dict(
             {
-                "images": spaces.Box(
-                    0, 255, (len(FAR_CAMERAS), image_size, image_size, 3), np.uint8
-                ),
-                "proprio": spaces.Box(
-                    np.array([-2, -2, -2, 0], np.float32), np.array([2, 2, 2, 1], np.float32)
-                ),
+                "images": spaces.Box(0, 255, pictures, np.uint8),
+                "proprio": spaces.Box(low, high),
             }
         )
-        self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-        self._mujoco = load_mujoco(render)
+        self.action_space = spaces.Box(-1.0, 1.0, (action_dim,), np.float32)
         self._render = render
-        self._renderer: Renderer | None = None
         self._task: Task | None = None
         self._steps = 0
         self._episode = 0
@@ -104,7 +112,7 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     @abc.abstractmethod
     def _advance(self, action: npt.NDArray[np.float64]) -> None:
-        """Moves the simulation by one control period. ``action`` is (4,) in [-1, 1]."""
+        """Moves the simulation by one control period. ``action`` is (A,) in [-1, 1]."""
 
     @abc.abstractmethod
     def _fulfilled(self, task: Task) -> bool:
@@ -116,7 +124,7 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     @abc.abstractmethod
     def expert_action(self, task: Task | str | None = None) -> npt.NDArray[np.float32]:
-        """(4,) what a scripted expert does now for ``task``, by default the current one."""
+        """(A,) what a scripted expert does now for ``task``, by default the current one."""
 
     @abc.abstractmethod
     def points_of_interest(self, task: Task | str) -> npt.NDArray[np.float64]:
@@ -124,7 +132,23 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     @abc.abstractmethod
     def _proprio(self) -> npt.NDArray[np.float32]:
-        """(4,) hand position in metres and gripper opening in [0, 1]."""
+        """(P,) what the policy is told about the robot."""
+
+    @abc.abstractmethod
+    def _pictures(self) -> npt.NDArray[np.uint8]:
+        """(2, S, S, 3) RGB of the present state; called only where there is drawing."""
+
+    @abc.abstractmethod
+    def project(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """(views, n, 2): where points (n, 3) appear, u rightwards and v downwards in [0, 1]."""
+
+    @abc.abstractmethod
+    def _simulator_state(self) -> npt.NDArray[np.float64]:
+        """(n,) everything that the simulator needs to come back to this moment."""
+
+    @abc.abstractmethod
+    def _set_simulator_state(self, state: npt.NDArray[np.float64]) -> None:
+        """Puts back what :meth:`_simulator_state` returned."""
 
     def _extra_state(self) -> Any:
         """Whatever the subclass keeps outside MuJoCo's state and changes during an episode."""
@@ -191,32 +215,35 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             "instruction": self._task.instruction,
             "success": False,
             "possible_tasks": tuple(t.name for t in self.possible_tasks()),
+            **self.labels,
         }
         return self.observe(), info
 
     def advance(self, action: npt.ArrayLike) -> None:
         """Executes one action without drawing a picture; values beyond [-1, 1] are clipped."""
         checked = np.asarray(action, dtype=np.float64)
-        if checked.shape != (ACTION_DIM,) or not np.isfinite(checked).all():
-            raise ValueError(f"an action is {ACTION_DIM} finite numbers, got {action!r}")
+        if checked.shape != (self.action_dim,) or not np.isfinite(checked).all():
+            raise ValueError(f"an action is {self.action_dim} finite numbers, got {action!r}")
         if self._task is None:
             raise RuntimeError("no episode is running: call reset() first")
         self._advance(np.clip(checked, -1.0, 1.0))
         self._steps += 1
 
     def step(self, action: npt.ArrayLike) -> StepResult:
-        """Executes one action (4,). Info holds ``success`` and ``successes`` of possible tasks."""
+        """Executes one action (A,). Info holds ``success`` and ``successes`` of possible tasks."""
         return self.step_chunk(np.asarray(action)[None])
 
     def step_chunk(self, actions: npt.ArrayLike | Sequence[npt.ArrayLike]) -> StepResult:
-        """Executes actions (H, 4) one after another and draws once, at the end.
+        """Executes actions (H, A) one after another and draws once, at the end.
 
         Stops early when the task succeeds or the episode is over; ``info["steps"]`` says how many
         actions were executed.
         """
         chunk = np.asarray(actions, dtype=np.float64)
         if chunk.ndim != 2 or not len(chunk):
-            raise ValueError(f"a chunk is (H, {ACTION_DIM}) with H >= 1, got shape {chunk.shape}")
+            raise ValueError(
+                f"a chunk is (H, {self.action_dim}) with H >= 1, got shape {chunk.shape}"
+            )
         success = truncated = False
         executed = 0
         for action in chunk:
@@ -226,7 +253,12 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             truncated = not success and self._steps >= self.max_episode_steps
             if success or truncated:
                 break
-        info: Info = {"success": success, "successes": self.successes(), "steps": executed}
+        info: Info = {
+            "success": success,
+            "successes": self.successes(),
+            "steps": executed,
+            **self.labels,
+        }
         return self.observe(), float(success), success, truncated, info
 
     def successes(self) -> dict[str, bool]:
@@ -235,25 +267,18 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     def observe(self) -> Observation:
         """The observation of the present state."""
-        if not self._render:
-            size = self.image_size
-            black = np.zeros((len(FAR_CAMERAS), size, size, 3), np.uint8)
-            return {"images": black, "proprio": self._proprio()}
-        if self._renderer is None:
-            self._renderer = Renderer(self.model, self.image_size)
-        return {"images": self._renderer.draw(self.data), "proprio": self._proprio()}
+        if self._render:
+            return {"images": self._pictures(), "proprio": self._proprio()}
+        black = np.zeros((NUM_VIEWS, self.image_size, self.image_size, 3), np.uint8)
+        return {"images": black, "proprio": self._proprio()}
 
-    def project(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """(views, n, 2): where points (n, 3) appear, u rightwards and v downwards in [0, 1]."""
-        return project(points, float(self.model.vis.global_.fovy))
+    def from_policy(self, actions: npt.ArrayLike) -> npt.NDArray[Any]:
+        """Actions (..., A) as a policy of this world says them, in this world's own convention."""
+        return np.asarray(actions)
 
     def get_state(self) -> WorldState:
         """The present moment, to come back to with :meth:`set_state` within this episode."""
-        mujoco = self._mujoco
-        kind = mujoco.mjtState.mjSTATE_INTEGRATION
-        buffer = np.empty(mujoco.mj_stateSize(self.model, kind))
-        mujoco.mj_getState(self.model, self.data, buffer, kind)
-        return WorldState(buffer, self._steps, self._episode, self._extra_state())
+        return WorldState(self._simulator_state(), self._steps, self._episode, self._extra_state())
 
     def set_state(self, state: WorldState) -> None:
         """Goes back to a moment of this episode. ValueError for a state of another episode."""
@@ -261,16 +286,9 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             raise ValueError(
                 "this state belongs to another episode: the fixtures may stand elsewhere now"
             )
-        mujoco = self._mujoco
-        kind = mujoco.mjtState.mjSTATE_INTEGRATION
-        mujoco.mj_setState(self.model, self.data, state.simulator, kind)
-        # Positions only: a full mj_forward would be slower and is not needed before a step.
-        mujoco.mj_kinematics(self.model, self.data)
+        self._set_simulator_state(state.simulator)
         self._steps = state.steps
         self._set_extra_state(state.extra)
 
     def close(self) -> None:
-        """Frees the renderer; harmless when repeated."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        """Frees what the world holds; harmless when repeated."""

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from comvla_sim.worlds.base import Task, World
+from comvla_sim.worlds.base import Task
+from comvla_sim.worlds.mujoco_world import MujocoWorld
 from comvla_sim.worlds.rendering import load_mujoco
 
 # Where the name, read aloud, is no English sentence. Others are their name without dashes.
@@ -62,7 +63,7 @@ def task_names() -> tuple[str, ...]:
     return tuple(sorted(name for name in ENV_CLS_MAP if name in ENV_POLICY_MAP))
 
 
-class SingleTask(World):
+class SingleTask(MujocoWorld):
     """The world ``"metaworld:NAME"``: Meta-World's own environment of that name.
 
     Success is what the environment reports after a step, hence always False before the first one.

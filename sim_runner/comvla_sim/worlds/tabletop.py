@@ -13,10 +13,11 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import numpy.typing as npt
 
-from comvla_sim.worlds.base import Task, World
+from comvla_sim.worlds.base import Task
 from comvla_sim.worlds.experts import metaworld_expert
 from comvla_sim.worlds.fixtures import FIXTURES, MANOEUVRES, Manoeuvre, Poses
 from comvla_sim.worlds.layout import Layout, draw_layout
+from comvla_sim.worlds.mujoco_world import MujocoWorld
 
 PHYSICS_STEPS = 5
 """Physics steps of 2.5 ms in a control period, as ``SawyerXYZEnv`` has them."""
@@ -64,7 +65,7 @@ def scene_xml(assets: Path) -> str:
     </mujoco>"""
 
 
-class Tabletop(World):
+class Tabletop(MujocoWorld):
     """The world ``"tabletop"``: five fixtures, eight tasks, two or three fixtures at a time.
 
     Args:
