@@ -1,4 +1,4 @@
-"""``comvla-sim bench transport | edge | batching``."""
+"""``comvla-sim bench transport | edge | batching | model``."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Registers ``bench`` and its three benchmarks."""
+    """Registers ``bench`` and its benchmarks."""
     parser = subparsers.add_parser(
         "bench",
-        help="measure transport, edge computations and batching against their limits",
+        help="measure transport, edge computations, batching and the model against their limits",
         description="Each benchmark measures its own limit in the same run and reports ratios.",
     )
     benches = parser.add_subparsers(dest="bench", required=True, metavar="BENCH")
@@ -32,7 +32,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Runs one benchmark and prints its table, or JSON with ``--json``."""
-    result = {"transport": _transport, "edge": _edge, "batching": _batching}[args.bench](args)
+    result = {"transport": _transport, "edge": _edge, "batching": _batching, "model": _model}[
+        args.bench
+    ](args)
     print(json.dumps(result, indent=2) if args.json else _text(result))
     return 0
 
@@ -53,10 +55,30 @@ def _batching_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=_at_least(0), help="of torch in the server (1)")
 
 
+def _model_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", choices=("7b", "mini"), help="OpenVLA-OFT's or mini's (mini)")
+    parser.add_argument("--half", choices=("cloud", "edge"), help="which half (cloud)")
+    parser.add_argument("--device", help="torch device (cpu)")
+    parser.add_argument("--dtype", choices=("bfloat16", "float32"), help="(bfloat16)")
+    parser.add_argument(
+        "--k",
+        dest="token_budgets",
+        type=_token_budgets,
+        metavar="K,K,…",
+        help="visual tokens of a request to the cloud half (512,128,64,32,16)",
+    )
+    parser.add_argument("--prompt-tokens", type=_at_least(1), help="of the prompt (30)")
+    parser.add_argument("--threads", type=_at_least(0), help="of torch (its own choice)")
+    parser.add_argument(
+        "--compile", action="store_true", default=None, help="the cloud half through torch.compile"
+    )
+
+
 _BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
     "transport": ("68 KiB up, 1 KiB down, against raw TCP and a websocket", _transport_options),
     "edge": ("vote, select, quantise, pack, against a matrix product", _edge_options),
     "batching": ("many robots on one server, against batches of one", _batching_options),
+    "model": ("one half with random weights, against bare matrix products", _model_options),
 }
 
 
@@ -78,10 +100,20 @@ def _batching(args: argparse.Namespace) -> dict[str, Any]:
     return batching.run(_given(batching.BatchingParameters, args))
 
 
+def _model(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.bench import model
+
+    return model.run(_given(model.ModelParameters, args))
+
+
 def _given(parameters: Callable[..., Any], args: argparse.Namespace) -> Any:
     """The parameters with what the command line named, and defaults for the rest."""
     names = {field.name for field in dataclasses.fields(parameters)}  # type: ignore[arg-type]
     return parameters(**{k: v for k, v in vars(args).items() if k in names and v is not None})
+
+
+def _token_budgets(text: str) -> tuple[int, ...]:
+    return tuple(_at_least(1)(part) for part in text.split(","))
 
 
 def _at_least(least: int) -> Callable[[str], int]:

@@ -10,11 +10,21 @@ from comvla_sim.bench.table import milliseconds, render
 _TIMES: dict[str, Callable[[Any], str]] = {
     "median_s": milliseconds,
     "p99_s": milliseconds,
+    "products_s": milliseconds,
+    "layer_s": milliseconds,
+    "hf_layer_s": milliseconds,
 }
 _HEADS = {
     "name": "",
     "median_s": "median ms",
     "p99_s": "p99 ms",
+    "sequence": "rows",
+    "products_s": "products ms",
+    "ratio_to_products": "x products",
+    "tflops_per_s": "TFLOP/s",
+    "layer_s": "layer ms",
+    "hf_layer_s": "transformers ms",
+    "layer_over_hf": "x transformers",
     "ratio_to_tcp": "x raw TCP",
     "p99_ratio_to_tcp": "p99 x raw TCP",
     "ratio_to_websocket": "x websocket",
@@ -59,4 +69,29 @@ def _conclusions(result: Mapping[str, Any]) -> list[str]:
             "",
             f"vote limit: {limit} ms, its three products at the {rate:.0f} GFLOP/s measured",
         ]
+    if result["bench"] == "model":
+        return _model_conclusions(result)
     return []
+
+
+def _model_conclusions(result: Mapping[str, Any]) -> list[str]:
+    weights, peak = result["weight_bytes"] / 1e9, result["peak_bytes"] / 1e9
+    lines = [
+        "",
+        f"weights {weights:.3f} GB, peak memory {peak:.3f} GB: {result['peak_ratio']:.2f} x",
+    ]
+    if "vision_flops" in result:
+        counted, own = result["vision_flops_counted"] / 1e12, result["vision_flops"] / 1e12
+        paper = result["paper_vision_tflops"]
+        lines.append(
+            f"vision TFLOPs: {counted:.4f} by torch's counter, {own:.4f} by formula"
+            + (f", {paper} in the paper" if paper else "")
+        )
+    if "time_512_over_32" in result:
+        lines.append(
+            f"K = 512 over K = 32: {result['time_512_over_32']:.2f} in time, "
+            f"{result['flops_512_over_32']:.2f} in operations of the backbone, Eq. (5)"
+        )
+    if "transformers" in result:
+        lines.append(f"Hugging Face transformers: {result['transformers']}")
+    return lines
