@@ -43,7 +43,7 @@ install_into() { # environment, stamp name, state, pip arguments...
     local environment=$1 stamp=$1/.comvla-$2 state=$3; shift 3
     if [ "$(cat "$stamp" 2>/dev/null)" = "$state" ]; then return; fi
     say "installing into $environment (minutes the first time)"
-    "$environment/bin/python" -m pip install --quiet --disable-pip-version-check "$@"
+    "$environment/bin/python" -m pip install -qq --disable-pip-version-check "$@"
     echo "$state" >"$stamp"
 }
 
