@@ -171,3 +171,16 @@ cli.main(["demo", "--out", {str(tmp_path / "page.html")!r}])
     demo.communicate()
     with pytest.raises(ProcessLookupError):
         os.kill(server, 0)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--mean-snr-db", "nan"), ("--seed", "-1"), ("--episodes", "0")]
+)
+def test_senseless_options_are_refused_before_the_server_starts(
+    option: str, value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(self: ServerProcess) -> None:
+        raise AssertionError("the server was started")
+
+    monkeypatch.setattr(ServerProcess, "__enter__", start)
+    assert cli.main(["demo", "--out", str(tmp_path / "page.html"), option, value]) == 2

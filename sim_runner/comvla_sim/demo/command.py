@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import itertools
 import json
 import signal
 import sys
@@ -18,11 +17,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from comvla_sim.experiments.errors import EvaluationError
 
 if TYPE_CHECKING:
-    from comvla_client.edge import EdgeModel
     from comvla_sim.demo.episode import Episode
     from comvla_sim.demo.scenario import Scene
     from comvla_sim.demo.server_process import ServerProcess
-    from comvla_sim.worlds.base import World
 
     Show: TypeAlias = Callable[[str, Scene], Callable[[Episode], None]]
 
@@ -56,9 +53,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Runs the demo. Returns 0 when it ran, however the robot did; 1 when the server failed."""
+    from comvla_sim.demo.scenario import fading, scenes
     from comvla_sim.demo.server_process import ServerProcess, ServerProcessError
+    from comvla_sim.worlds.tabletop import Tabletop
 
     started = time.monotonic()
+    # What is wrong with the options is said before anything is started.
+    scenes(Tabletop.tasks, seed=args.seed, episodes=args.episodes)
+    fading(args.mean_snr_db, seed=0)
     _claim(args.out)
     with _terminated_like_interrupted():
         try:
@@ -116,7 +118,7 @@ def _play(args: argparse.Namespace, server: ServerProcess) -> dict[str, Any]:
     import torch
 
     from comvla_sim import worlds
-    from comvla_sim.demo import figures
+    from comvla_sim.demo import figures, rounds
     from comvla_sim.demo.page import render
     from comvla_sim.demo.scenario import LINK, scenes
     from comvla_sim.experiments.policy import load_edge_half
@@ -127,14 +129,14 @@ def _play(args: argparse.Namespace, server: ServerProcess) -> dict[str, Any]:
     try:
         program = scenes(world.tasks, seed=args.seed, episodes=args.episodes)
         with _progress(world.max_episode_steps) as show:
-            limited = [
-                _over_link(server, world, edge, scene, args.mean_snr_db, show) for scene in program
-            ]
-            unlimited = [_without_limit(server, world, edge, scene, show) for scene in program]
+            stage = rounds.Stage(server, world, edge, args.mean_snr_db)
+            limited = [stage.over_link(s, show("voted tokens", s)) for s in program]
+            unlimited = [stage.without_limit(s, show("all tokens", s)) for s in program]
     finally:
         world.close()
     use = figures.link_use(limited)
-    full = figures.figures_of(unlimited, _full_air_s(limited, unlimited, args.mean_snr_db))
+    full_air_s = rounds.full_air_s(limited, unlimited, args.mean_snr_db)
+    full = figures.figures_of(unlimited, full_air_s)
     ours = figures.figures_of(limited)
     command = _command(args)
     args.out.write_text(
@@ -164,66 +166,6 @@ def _play(args: argparse.Namespace, server: ServerProcess) -> dict[str, Any]:
             _row(episode, reference) for episode, reference in zip(limited, unlimited, strict=True)
         ],
     }
-
-
-def _over_link(
-    server: ServerProcess,
-    world: World,
-    edge: EdgeModel,
-    scene: Scene,
-    mean_snr_db: float,
-    show: Show,
-) -> Episode:
-    from comvla_client import ComVLAClient
-    from comvla_client.transport import GrpcTransport
-    from comvla_sim.demo.episode import run_episode
-    from comvla_sim.demo.film import FilmCamera
-    from comvla_sim.demo.scenario import LINK, MIN_TOKENS
-    from comvla_sim.link import EnforcedLink
-
-    server.require_running()
-    link = EnforcedLink(GrpcTransport(server.target), scene.channel(mean_snr_db), LINK)
-    client = ComVLAClient(
-        link, edge=edge, link=LINK, budget="framed", min_tokens=MIN_TOKENS, seed=scene.number
-    )
-    camera = FilmCamera(world)
-    with client, contextlib.closing(camera):
-        episode = run_episode(
-            world, client, scene, link=link, camera=camera, on_period=show("voted tokens", scene)
-        )
-    server.require_running()
-    return episode
-
-
-def _without_limit(
-    server: ServerProcess,
-    world: World,
-    edge: EdgeModel,
-    scene: Scene,
-    show: Show,
-) -> Episode:
-    from comvla_client import ComVLAClient
-    from comvla_sim.demo.episode import run_episode
-
-    server.require_running()
-    with ComVLAClient(server.target, edge=edge, selector="full", seed=scene.number) as client:
-        episode = run_episode(world, client, scene, on_period=show("all tokens", scene))
-    server.require_running()
-    return episode
-
-
-def _full_air_s(
-    limited: list[Episode], unlimited: list[Episode], mean_snr_db: float
-) -> Iterator[float]:
-    """How long a request with all tokens would be on the air, from every period we sent in."""
-    from comvla_sim.demo.figures import air_time_s
-    from comvla_sim.demo.scenario import LINK
-
-    for episode, reference in zip(limited, unlimited, strict=True):
-        full_bits = 8 * max(query.report.framed_bytes for query in reference.queries)
-        for query in episode.queries:
-            rest = itertools.islice(episode.scene.channel(mean_snr_db), query.period, None)
-            yield air_time_s(full_bits, map(LINK.capacity_bits, rest), LINK.period_s)
 
 
 def _row(episode: Episode, reference: Episode) -> dict[str, Any]:

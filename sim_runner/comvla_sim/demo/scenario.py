@@ -22,6 +22,18 @@ DOPPLER_HZ = 10.0
 MIN_TOKENS = 16
 """The policy was not trained with fewer. In a deeper fade the robot holds for a period instead."""
 
+DEADLINE_S = 10.0
+"""Simulated time stands still while the policy computes: a busy machine shall not change the film."""
+
+
+def fading(mean_snr_db: float, seed: int) -> RicianChannel:
+    """The demo's kind of radio channel.
+
+    Raises:
+        LinkError: a mean SNR that is not finite.
+    """
+    return RicianChannel(mean_snr_db, DOPPLER_HZ, LINK.period_s, seed, rician_k=RICIAN_K)
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -41,9 +53,7 @@ class Scene:
 
     def channel(self, mean_snr_db: float) -> RicianChannel:
         """The radio channel of this episode."""
-        return RicianChannel(
-            mean_snr_db, DOPPLER_HZ, LINK.period_s, self.channel_seed, rician_k=RICIAN_K
-        )
+        return fading(mean_snr_db, self.channel_seed)
 
 
 def scenes(tasks: Sequence[Task], *, seed: int, episodes: int) -> list[Scene]:
