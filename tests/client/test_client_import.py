@@ -37,6 +37,7 @@ def seconds_to_import(statement: str) -> float:
     return min(float(run_python(code)) for _ in range(3))
 
 
+@pytest.mark.alone
 def test_import_costs_less_than_half_a_second_more_than_numpy_and_grpc() -> None:
     extra_s = seconds_to_import(f"{PREREQUISITES}, comvla_client") - seconds_to_import(
         PREREQUISITES

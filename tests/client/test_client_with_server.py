@@ -151,6 +151,7 @@ def server_process(checkpoint: Path, port: int) -> Iterator[tuple[subprocess.Pop
         process.communicate()
 
 
+@pytest.mark.alone
 def test_a_server_killed_and_restarted_in_mid_episode(policy: Policy, checkpoint: Path) -> None:
     """No exception, the rest of the chunk, holding, and back with the first step after its return."""
     sources = []

@@ -107,6 +107,7 @@ def test_a_step_over_a_real_socket() -> None:
     assert len(service.requests) == 1
 
 
+@pytest.mark.alone
 def test_a_server_that_accepts_the_call_and_never_answers() -> None:
     service = StubService()
     service.before = never_answer
@@ -117,6 +118,7 @@ def test_a_server_that_accepts_the_call_and_never_answers() -> None:
         assert "cloud" in [chunk.source for chunk in chunks]
 
 
+@pytest.mark.alone
 def test_a_socket_that_accepts_and_never_speaks() -> None:
     with serving() as (target, _):
         client = client_of(target, deadline_s=0.02)
