@@ -62,6 +62,25 @@ def add_parser(subparsers: Any) -> None:
         metavar="N",
         help="CPU threads of the model (default: torch decides)",
     )
+    model.add_argument(
+        "--statistics-key",
+        metavar="KEY",
+        help="data set whose statistics apply, where the checkpoint holds several",
+    )
+    model.add_argument(
+        "--fastv",
+        type=_fastv,
+        metavar="LAYER,DROP",
+        help="drop this share of the visual tokens before this layer, e.g. 3,0.75: saves operations, not bytes",
+    )
+    model.add_argument(
+        "--compact-positions",
+        action="store_true",
+        help="number the tokens that arrive 0, 1, 2, …, as VLA-ADP does (default: original positions)",
+    )
+    model.add_argument(
+        "--compile", action="store_true", help="run the backbone through torch.compile"
+    )
     network = parser.add_argument_group("network")
     network.add_argument(
         "--host",
@@ -127,11 +146,32 @@ def run(args: argparse.Namespace) -> int:
     )
     logs.configure(args.log_format, args.log_level)
     return asyncio.run(
-        _serve(settings, lambda: load_engine(args.model, args.device, args.dtype, args.threads))
+        _serve(
+            settings,
+            lambda: load_engine(
+                args.model,
+                args.device,
+                args.dtype,
+                args.threads,
+                args.statistics_key,
+                args.fastv,
+                args.compact_positions,
+                args.compile,
+            ),
+        )
     )
 
 
-def load_engine(model: str, device: str, dtype: str, threads: int | None) -> Engine:
+def load_engine(
+    model: str,
+    device: str,
+    dtype: str,
+    threads: int | None,
+    statistics_key: str | None = None,
+    fastv: tuple[int, float] | None = None,
+    compact_positions: bool = False,
+    compiled: bool = False,
+) -> Engine:
     """The cloud half of a checkpoint, ready to run.
 
     Raises:
@@ -140,11 +180,37 @@ def load_engine(model: str, device: str, dtype: str, threads: int | None) -> Eng
     import torch
 
     from comvla_server.engine import Engine
-    from comvla_vla import load_cloud
+    from comvla_vla import CloudOptions, FastV, load_cloud
 
     if threads is not None:
         torch.set_num_threads(threads)
-    return Engine(load_cloud(model, device=device, dtype=getattr(torch, dtype)))
+    options = CloudOptions(
+        fastv=None if fastv is None else FastV(*fastv),
+        compact_positions=compact_positions,
+        compile=compiled,
+    )
+    return Engine(
+        load_cloud(
+            model,
+            device=device,
+            dtype=getattr(torch, dtype),
+            statistics_key=statistics_key,
+            options=options,
+        )
+    )
+
+
+def _fastv(text: str) -> tuple[int, float]:
+    layer, _, drop = text.partition(",")
+    try:
+        read = int(layer), float(drop)
+    except ValueError:
+        read = 0, 0.0
+    if read[0] < 1 or not 0 <= read[1] < 1:
+        raise argparse.ArgumentTypeError(
+            f"expected a layer >= 1 and a share below 1, e.g. 3,0.75, got {text!r}"
+        )
+    return read
 
 
 async def _serve(settings: ServerSettings, load: Callable[[], Engine]) -> int:

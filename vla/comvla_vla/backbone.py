@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from comvla_vla.attention import attend
 from comvla_vla.config import BackboneConfig
 from comvla_vla.fastv import last_row_attention, surviving_rows
 from comvla_vla.options import FastV
@@ -86,7 +87,7 @@ class SelfAttention(nn.Module):
             q_, k_, v_ = (
                 t[rows].view(count, length, heads, width).transpose(1, 2) for t in (q, k, v)
             )
-            mixed.append(F.scaled_dot_product_attention(q_, k_, v_).transpose(1, 2).flatten(0, 1))
+            mixed.append(attend(q_, k_, v_).transpose(1, 2).flatten(0, 1))
         out: Tensor = self.o_proj(torch.cat(mixed).flatten(1))
         return out
 
