@@ -48,7 +48,7 @@ def print_summary(summary: dict[str, Any], console: Console | None = None) -> No
 
 
 def _table(texts: Sequence[str], numbers: Sequence[str]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 0, 0, 1))
     for name in texts:
         table.add_column(name, overflow="fold", min_width=11)
     for name in numbers:
