@@ -162,7 +162,7 @@ def test_vla_adp_scores_from_the_second_layer(reference, ratio):
         flat = rotary_tables(zero, net.config.backbone, rows.dtype)  # position 0 does not rotate
 
         def parts(x):
-            return second.self_attn.queries_and_keys(second.input_layernorm(x), *flat)
+            return second.before(x, *flat)
 
         scores = text_driven_scores(parts(words)[0], parts(hidden[1:513])[1])
     np.testing.assert_allclose(scores.numpy(), want["importance"], atol=TOLERANCE)

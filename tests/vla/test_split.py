@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from comvla import codec
 from comvla.errors import InstructionError, ObservationError
-from comvla_vla import PolicyRequest, random_policy
+from comvla_vla import CloudModel, CloudOptions, PolicyRequest, random_policy
 from comvla_vla.preprocess import normalise
 
 INSTRUCTIONS = ("pull the green drawer open", "press the button", "slide the window leftwards")
@@ -169,3 +169,30 @@ def test_pictures_need_not_be_contiguous(policy, observation):
     flipped = [image[::-1, ::-1] for image in images]
     copies = [np.ascontiguousarray(image) for image in flipped]
     assert torch.equal(policy[0].encode(flipped), policy[0].encode(copies))
+
+
+def test_compiled_rows_answer_alike_whatever_the_number_of_rows(policy, observation, monkeypatch):
+    """Traced with free row counts; the code generator is left out, because it takes minutes."""
+    graphs = []
+
+    def trace(function, *, dynamic):
+        def backend(graph, example_inputs):
+            graphs.append(graph)
+            return graph.forward
+
+        return compiled(function, dynamic=dynamic, backend=backend)
+
+    compiled = torch.compile
+    monkeypatch.setattr(torch, "compile", trace)
+    fresh = random_policy(seed=3)[1]
+    cloud = CloudModel(
+        fresh.net, fresh.prompt, fresh.statistics, fresh.info, CloudOptions(compile=True)
+    )
+    images, proprio = observation
+    for ks in ([16], [40, 7, 40], [200], [512]):
+        requests = [
+            through_the_wire(policy, images, proprio, INSTRUCTIONS[0], np.arange(k)) for k in ks
+        ]
+        for ours, eager in zip(cloud.predict(requests), policy[1].predict(requests), strict=True):
+            np.testing.assert_allclose(ours, eager, atol=1e-5)
+    assert len(graphs) == 2, "one for what comes before attention and one for what comes after"

@@ -56,10 +56,7 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
 
 
 class SelfAttention(nn.Module):
-    """Bidirectional attention inside each packed sequence; query, key and value weights are one.
-
-    Neighbouring sequences of one length share a kernel call, so callers sort by length.
-    """
+    """Weights of bidirectional attention; those of query, key and value are one matrix."""
 
     def __init__(self, config: BackboneConfig) -> None:
         super().__init__()
@@ -67,29 +64,34 @@ class SelfAttention(nn.Module):
         self.qkv_proj = nn.Linear(config.hidden, 3 * config.hidden, bias=False)
         self.o_proj = nn.Linear(config.hidden, config.hidden, bias=False)
 
-    def queries_and_keys(self, x: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotated queries and keys, each (R, heads, head_dim), of normalised rows (R, d)."""
-        weight = self.qkv_proj.weight[: 2 * self.config.hidden]
-        both = F.linear(x, weight).view(-1, 2, self.config.heads, self.config.head_dim)
-        q, k = both.unbind(1)
-        return rotate(q, cos, sin), rotate(k, cos, sin)
+    def queries_keys_values(
+        self, x: Tensor, cos: Tensor, sin: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Rotated queries and keys, and values, each (R, heads, head_dim), of normalised rows (R, d)."""
+        q, k, v = self.qkv_proj(x).view(-1, 3, self.config.heads, self.config.head_dim).unbind(1)
+        return rotate(q, cos, sin), rotate(k, cos, sin), v
 
-    def forward(self, x: Tensor, cos: Tensor, sin: Tensor, lengths: Sequence[int]) -> Tensor:
-        """Rows (R, d) of sequences with ``lengths`` (summing to R) to (R, d)."""
-        heads, width = self.config.heads, self.config.head_dim
-        q, k, v = self.qkv_proj(x).view(-1, 3, heads, width).unbind(1)
-        q, k = rotate(q, cos, sin), rotate(k, cos, sin)
-        mixed, start = [], 0
-        for length, run in groupby(lengths):
-            count = len(list(run))
-            rows = slice(start, start + count * length)
-            start = rows.stop
-            q_, k_, v_ = (
-                t[rows].view(count, length, heads, width).transpose(1, 2) for t in (q, k, v)
-            )
-            mixed.append(attend(q_, k_, v_).transpose(1, 2).flatten(0, 1))
-        out: Tensor = self.o_proj(torch.cat(mixed).flatten(1))
-        return out
+
+def packed_attention(q: Tensor, k: Tensor, v: Tensor, lengths: Sequence[int]) -> Tensor:
+    """Attention inside each packed sequence; the only place that knows where one ends.
+
+    Neighbouring sequences of one length share a kernel call, so callers sort by length.
+
+    Args:
+        q, k, v: (R, heads, head_dim). lengths: of the sequences, summing to R.
+
+    Returns:
+        (R, heads * head_dim).
+    """
+    heads, width = q.shape[1:]
+    mixed, start = [], 0
+    for length, run in groupby(lengths):
+        count = len(list(run))
+        rows = slice(start, start + count * length)
+        start = rows.stop
+        q_, k_, v_ = (t[rows].view(count, length, heads, width).transpose(1, 2) for t in (q, k, v))
+        mixed.append(attend(q_, k_, v_).transpose(1, 2).flatten(0, 1))
+    return torch.cat(mixed).flatten(1)
 
 
 class SwiGLU(nn.Module):
@@ -117,11 +119,19 @@ class Layer(nn.Module):
         self.post_attention_layernorm = RMSNorm(config.hidden, config.rms_eps)
         self.mlp = SwiGLU(config)
 
-    def forward(self, x: Tensor, cos: Tensor, sin: Tensor, lengths: Sequence[int]) -> Tensor:
-        """Rows (R, d) to (R, d)."""
-        x = x + self.self_attn(self.input_layernorm(x), cos, sin, lengths)
+    def before(self, x: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What comes before attention, row by row: queries, keys and values of rows (R, d)."""
+        return self.self_attn.queries_keys_values(self.input_layernorm(x), cos, sin)
+
+    def after(self, x: Tensor, mixed: Tensor) -> Tensor:
+        """What comes after attention, row by row: (R, d) and attention's (R, d) to (R, d)."""
+        x = x + self.self_attn.o_proj(mixed)
         out: Tensor = x + self.mlp(self.post_attention_layernorm(x))
         return out
+
+    def forward(self, x: Tensor, cos: Tensor, sin: Tensor, lengths: Sequence[int]) -> Tensor:
+        """Rows (R, d) of sequences with ``lengths`` (summing to R) to (R, d)."""
+        return self.after(x, packed_attention(*self.before(x, cos, sin), lengths))
 
 
 class Backbone(nn.Module):
@@ -132,6 +142,12 @@ class Backbone(nn.Module):
         self.config = config
         self.layers = nn.ModuleList(Layer(config) for _ in range(config.layers))
         self.norm = RMSNorm(config.hidden, config.rms_eps)
+        self._before, self._after = Layer.before, Layer.after
+
+    def compile_rows(self) -> None:
+        """Compiles what is done row by row, once for any number of rows; attention stays as it is."""
+        self._before = torch.compile(Layer.before, dynamic=True)
+        self._after = torch.compile(Layer.after, dynamic=True)
 
     def forward(
         self,
@@ -157,6 +173,7 @@ class Backbone(nn.Module):
         lengths = list(lengths)
         before = rows
         for index, layer in enumerate(self.layers):
+            assert isinstance(layer, Layer)
             if fastv is not None and index == fastv.layer:
                 ranking = self.layers[index - 1]
                 assert isinstance(ranking, Layer)
@@ -164,6 +181,7 @@ class Backbone(nn.Module):
                 kept, lengths = surviving_rows(seen, visual, fastv)
                 rows, cos, sin = rows[kept], cos[kept], sin[kept]
             before = rows
-            rows = layer(rows, cos, sin, lengths)
+            mixed = packed_attention(*self._before(layer, rows, cos, sin), lengths)
+            rows = self._after(layer, rows, mixed)
         out: Tensor = self.norm(rows)
         return out, lengths

@@ -46,7 +46,7 @@ class CloudModel:
         parameter = next(net.parameters())
         self.device, self.dtype = parameter.device, parameter.dtype
         if self.options.compile:
-            net.backbone.compile(dynamic=True)
+            net.backbone.compile_rows()
 
     def check_instruction(self, instruction: str) -> None:
         """Raises InstructionError where :meth:`predict` would."""

@@ -32,7 +32,7 @@ def last_row_attention(
     Returns:
         One (L,) float32 distribution for each sequence.
     """
-    q, k = layer.self_attn.queries_and_keys(layer.input_layernorm(rows), cos, sin)
+    q, k, _ = layer.before(rows, cos, sin)
     out: list[Tensor] = []
     end = 0
     for length in lengths:

@@ -39,8 +39,8 @@ class CloudOptions:
         compact_positions: number the tokens that arrived 0, 1, 2, … in raster order, as VLA-ADP does, instead of
             leaving each where it was in the unpruned sequence.
         fastv: drop tokens inside the backbone; None for never.
-        compile: run the backbone through ``torch.compile``; the first calls are then slow, and a C++ compiler is
-            needed on a CPU.
+        compile: run what the backbone does row by row through ``torch.compile``; the first calls are then slow, and
+            a C++ compiler is needed on a CPU.
         noise_seed: of a diffusion head's starting noise; one request, one seed, one answer.
     """
 
