@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from comvla_sim.training.trainer import Progress, Recipe, Trainer
 
-# Layouts that validation uses; training takes 0 .. layouts-1 and evaluation starts at a million.
-VALIDATION_LAYOUTS = range(900_000, 900_040)
+# Training takes layouts 0 .. layouts-1, validation starts here, evaluation at a million.
+FIRST_VALIDATION_LAYOUT = 900_000
 
 DESCRIPTION = """\
 Generates demonstrations with scripted experts, trains a small language-following policy on them, and writes
@@ -27,7 +27,7 @@ draw the same frames, numbers of tokens and selections in the same order.
 EPILOG = """\
 examples:
   comvla-sim train --out runs/mini                         the shipped policy: trained on voted tokens only
-  comvla-sim train --out runs/fair --random-share 0.5 --data runs/mini/demonstrations
+  comvla-sim train --out runs/fair --random-share 0.5 --steps 2000 --data runs/mini/demonstrations
                                                            a fair control for random selection
   comvla-sim train --out runs/try --layouts 50 --steps 200 a few minutes, to see it work
 """
@@ -44,8 +44,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--out", type=Path, default=Path("runs/mini"), help="folder of the run")
     parser.add_argument("--data", type=Path, help="demonstrations (default: OUT/demonstrations)")
-    parser.add_argument("--layouts", type=int, default=1000, help="tables to learn from (1000)")
-    parser.add_argument("--steps", type=int, default=4500, help="optimiser steps (4500)")
+    parser.add_argument("--layouts", type=int, default=600, help="tables to learn from (600)")
+    parser.add_argument(
+        "--validation-layouts", type=int, default=40, help="tables to check on (40)", metavar="N"
+    )
+    parser.add_argument("--steps", type=int, default=4000, help="optimiser steps (4000)")
     parser.add_argument("--seed", type=int, default=0, help="of weights and sampling (0)")
     parser.add_argument(
         "--random-share",
@@ -65,10 +68,13 @@ def run(args: argparse.Namespace) -> int:
     """Generates, trains, exports. Returns 0, or 130 after Ctrl-C."""
     from comvla_sim.training.trainer import Recipe, TrainingError
 
-    if args.layouts < 1 or args.steps < 1 or not 0 <= args.random_share <= 1:
+    smallest = min(args.layouts, args.validation_layouts, args.steps)
+    most = FIRST_VALIDATION_LAYOUT
+    if smallest < 1 or args.layouts > most or not 0 <= args.random_share <= 1:
         raise TrainingError(
-            "expected --layouts and --steps of at least 1 and --random-share within 0 .. 1, got "
-            f"{args.layouts}, {args.steps}, {args.random_share}"
+            f"expected 1 to {most} --layouts, at least one of --validation-layouts and --steps, and "
+            f"--random-share within 0 .. 1, got {args.layouts}, {args.validation_layouts}, "
+            f"{args.steps}, {args.random_share}"
         )
     recipe = Recipe(
         seed=args.seed,
@@ -78,7 +84,9 @@ def run(args: argparse.Namespace) -> int:
     )
     data = args.data or args.out / "demonstrations"
     try:
-        _demonstrate(data, args.layouts, args.workers or os.cpu_count() or 1)
+        _demonstrate(
+            data, args.layouts, args.validation_layouts, args.workers or os.cpu_count() or 1
+        )
         summary = _train(args.out, data, args.layouts, recipe, args.threads)
     except KeyboardInterrupt:
         print("\nstopped; run the same command again to go on", file=sys.stderr)
@@ -90,10 +98,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _demonstrate(data: Path, layouts: int, workers: int) -> None:
+def _demonstrate(data: Path, layouts: int, validation_layouts: int, workers: int) -> None:
     from comvla_sim.training.demonstrations import generate, progress_bar
 
-    for name, seeds in (("validation", VALIDATION_LAYOUTS), ("train", range(layouts))):
+    first = FIRST_VALIDATION_LAYOUT
+    parts = {"validation": range(first, first + validation_layouts), "train": range(layouts)}
+    for name, seeds in parts.items():
         with progress_bar() as bar:
             generate(data / name, layouts=seeds, workers=workers, progress=bar)
 

@@ -43,11 +43,13 @@ class Progress:
 @contextlib.contextmanager
 def progress_bar() -> Iterator[Callable[[Progress], None]]:
     """A bar on the terminal, to be given to :func:`generate` as ``progress``."""
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("layouts, {task.fields[frames]}"))
-    with Bar(TextColumn("demonstrations"), *columns, TimeRemainingColumn()) as bar:
+    console = Console(stderr=True)
+    with Bar(TextColumn("demonstrations"), *columns, TimeRemainingColumn(), console=console) as bar:
         line = bar.add_task("", total=None, frames="")
 
         def show(progress: Progress) -> None:
