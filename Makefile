@@ -39,11 +39,12 @@ lint: ## style, types, import rules, protocol rules
 	$(BIN)/lint-imports
 	$(BIN)/buf lint proto
 
-bench: ## transport, edge and batching, each against a limit measured in the same run
+bench: ## transport, edge, batching and model, each against a limit measured in the same run
 	@tools/setup.sh sim
 	$(BIN)/comvla-sim bench transport $(ARGS)
 	$(BIN)/comvla-sim bench edge $(ARGS)
 	$(BIN)/comvla-sim bench batching $(ARGS)
+	$(BIN)/comvla-sim bench model $(ARGS)
 
 proto: ## regenerate the code of proto/comvla/v1/policy.proto
 	@tools/proto.sh
