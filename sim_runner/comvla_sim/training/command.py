@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from comvla_sim.training.trainer import Progress, Recipe, Trainer
 
-# Training takes layouts 0 .. layouts-1, validation starts here, evaluation at a million.
+# Training takes layouts from 0, validation from here; evaluation starts at a million.
 FIRST_VALIDATION_LAYOUT = 900_000
+MOST_VALIDATION_LAYOUTS = 100_000
 
 DESCRIPTION = """\
 Generates demonstrations with scripted experts, trains a small language-following policy on them, and writes
@@ -68,13 +69,16 @@ def run(args: argparse.Namespace) -> int:
     """Generates, trains, exports. Returns 0, or 130 after Ctrl-C."""
     from comvla_sim.training.trainer import Recipe, TrainingError
 
-    smallest = min(args.layouts, args.validation_layouts, args.steps)
-    most = FIRST_VALIDATION_LAYOUT
-    if smallest < 1 or args.layouts > most or not 0 <= args.random_share <= 1:
+    if (
+        not 1 <= args.layouts <= FIRST_VALIDATION_LAYOUT
+        or not 1 <= args.validation_layouts <= MOST_VALIDATION_LAYOUTS
+        or args.steps < 1
+        or not 0 <= args.random_share <= 1
+    ):
         raise TrainingError(
-            f"expected 1 to {most} --layouts, at least one of --validation-layouts and --steps, and "
-            f"--random-share within 0 .. 1, got {args.layouts}, {args.validation_layouts}, "
-            f"{args.steps}, {args.random_share}"
+            f"expected 1 to {FIRST_VALIDATION_LAYOUT} --layouts, 1 to {MOST_VALIDATION_LAYOUTS} "
+            "--validation-layouts, at least one of --steps and --random-share within 0 .. 1, got "
+            f"{args.layouts}, {args.validation_layouts}, {args.steps}, {args.random_share}"
         )
     recipe = Recipe(
         seed=args.seed,
