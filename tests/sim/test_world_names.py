@@ -16,10 +16,13 @@ pytestmark = [
 ]
 
 
-def test_the_names_are_the_tabletop_and_all_of_meta_world() -> None:
+def test_the_names_are_the_tabletop_all_of_meta_world_and_the_suites_of_libero() -> None:
     assert names()[0] == "tabletop"
     assert "metaworld:drawer-open-v3" in names()
-    assert len(names()) == 51
+    assert sum(name.startswith("metaworld:") for name in names()) == 50
+    assert [name for name in names() if name.startswith("libero:")] == [
+        f"libero:libero_{suite}" for suite in ("spatial", "object", "goal", "10")
+    ]
 
 
 @pytest.mark.parametrize("name", ["kitchen", "metaworld:make-coffee-v3", "metaworld:", ""])
