@@ -11,7 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from comvla_vla.attention import attend
 from comvla_vla.config import TowerConfig
 
 
@@ -40,7 +39,7 @@ class Attention(nn.Module):
         """(B, T, dim) to (B, T, dim)."""
         b, t, dim = x.shape
         q, k, v = self.qkv(x).view(b, t, 3, self.heads, dim // self.heads).permute(2, 0, 3, 1, 4)
-        mixed = attend(q, k, v)
+        mixed = F.scaled_dot_product_attention(q, k, v)
         out: Tensor = self.proj(mixed.transpose(1, 2).reshape(b, t, dim))
         return out
 

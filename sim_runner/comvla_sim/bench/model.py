@@ -177,7 +177,7 @@ def _against(
     cos, sin = rotary_tables(torch.arange(length, device=model.device), config, model.dtype)
     timings: dict[str, Timing] = measure(
         {"ours": lambda: layer(rows, cos, sin, [length]), "theirs": lambda: theirs(rows)},
-        repetitions=max(5, parameters.repetitions),
+        repetitions=max(10, parameters.repetitions),
         warm_up=2,
     )
     ours, other = timings["ours"].median_s, timings["theirs"].median_s
