@@ -19,6 +19,7 @@ COMMANDS = {
     "train": "comvla_sim.training.command",
     "report": "comvla_sim.report.command",
     "bench": "comvla_sim.bench.command",
+    "libero": "comvla_sim.worlds.libero.command",
 }
 """Subcommand to module."""
 

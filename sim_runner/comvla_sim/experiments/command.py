@@ -49,7 +49,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--world", default="tabletop", help="tabletop, or metaworld:TASK (tabletop)"
+        "--world", default="tabletop", help="tabletop, metaworld:TASK or libero:SUITE (tabletop)"
     )
     parser.add_argument(
         "--model", default="mini", help="mini, random, or a checkpoint folder (mini)"
@@ -126,6 +126,11 @@ def run(args: argparse.Namespace) -> int:
         from comvla_sim.report.terminal import print_summary
 
         print_summary(summary)
+    if subject.settings.get("assets") == "stand-in":
+        print(
+            "measured with stand-in assets: not to be compared with published success rates",
+            file=sys.stderr,
+        )
     return 0
 
 

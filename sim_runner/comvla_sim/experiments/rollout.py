@@ -170,7 +170,8 @@ def run_episode(
                     f"{chunk.report.detail}): check the server, then run the same command again"
                 )
             statistics.add(chunk.report.positions, None if film else world, roles.spoken)
-            for action in chunk.actions[: world.max_episode_steps - steps]:
+            actions = world.from_policy(chunk.actions)
+            for action in actions[: world.max_episode_steps - steps]:
                 world.advance(action)
                 steps += 1
                 fulfilled = world.successes()

@@ -58,7 +58,7 @@ def inspect(settings: EvalSettings) -> Subject:
         world = make(settings.world, render=False)
     except ValueError as error:
         raise EvaluationError(f"--world: {error}") from error
-    tasks = world.tasks
+    tasks, labels, elsewhere = world.tasks, dict(world.labels), dict(world.versions)
     world.close()
     shared = {
         "world": settings.world,
@@ -67,7 +67,11 @@ def inspect(settings: EvalSettings) -> Subject:
         "model_fingerprint": info.fingerprint,
         "quantization": settings.quantization,
         "link": "ideal",
-        "versions": {name: _version(name) for name in ("comvla", "metaworld", "mujoco")},
+        "versions": {
+            **{name: _version(name) for name in ("comvla", "metaworld", "mujoco")},
+            **elsewhere,
+        },
+        **labels,
     }
     return Subject(shared, info.num_tokens, tasks)
 
@@ -115,7 +119,9 @@ class Worker:
             raise EvaluationError(
                 f"the worlds draw square pictures, the model sees {height}×{width}"
             )
-        self._world: World = make(settings.world, image_size=height)
+        # Where the model resizes pictures itself, it gets them in the world's own size.
+        resizes = bool(getattr(self._edge, "any_image_size", False))
+        self._world: World = make(settings.world, image_size=None if resizes else height)
 
     def run(self, spec: EpisodeSpec) -> Measured:
         """One episode."""

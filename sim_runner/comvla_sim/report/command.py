@@ -115,6 +115,11 @@ def section(name: str, rows: list[dict[str, Any]], summary: dict[str, Any]) -> S
         f"{shared['quantization']} over a link that loses nothing.",
         "Measured with " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
     ]
+    if shared.get("assets") == "stand-in":
+        story.append(
+            "Drawn with stand-in assets: these success rates must not be compared with published "
+            "ones."
+        )
     aggregate = summary["aggregate"]
     return Section(
         title=name,

@@ -73,6 +73,8 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     max_episode_steps: int
     labels: Mapping[str, str] = MappingProxyType({})
     """What has to be said with every figure measured here; it goes into info and result rows."""
+    versions: Mapping[str, str] = MappingProxyType({})
+    """Of a simulator that runs in another Python than this one."""
     model: Any = None
     data: Any = None
     observation_space: spaces.Dict  # type: ignore[assignment]

@@ -29,7 +29,7 @@ class WorkerError(ComVLAError, RuntimeError):
     """A world's process failed. The message holds the traceback of that process."""
 
 
-def _serve(connection: _Connection, name: str, image_size: int, render: bool) -> None:
+def _serve(connection: _Connection, name: str, image_size: int | None, render: bool) -> None:
     """The life of a worker: make the world, then answer (method, arguments) until told to stop."""
     # Ctrl-C reaches every process of the terminal. The parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -66,7 +66,7 @@ class VectorWorld:
     Args:
         name: as for :func:`comvla_sim.worlds.make`.
         num_envs: number of worlds and processes.
-        image_size: side of a picture in pixels.
+        image_size: side of a picture in pixels; None takes the world's own.
         render: False saves the drawing.
 
     Raises:
@@ -74,7 +74,7 @@ class VectorWorld:
     """
 
     def __init__(
-        self, name: str, num_envs: int, *, image_size: int = 128, render: bool = True
+        self, name: str, num_envs: int, *, image_size: int | None = None, render: bool = True
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")

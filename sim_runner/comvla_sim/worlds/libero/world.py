@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -11,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from comvla_sim.worlds.base import NUM_VIEWS, Info, Observation, Task, World
-from comvla_sim.worlds.libero.assets import find_assets
 from comvla_sim.worlds.libero.child.framing import Message
-from comvla_sim.worlds.libero.child.options import Options
 from comvla_sim.worlds.libero.conventions import (
     ACTION_DIM,
     MAX_STEPS,
@@ -21,9 +17,9 @@ from comvla_sim.worlds.libero.conventions import (
     proprioception,
     upright,
 )
-from comvla_sim.worlds.libero.environment import LiberoEnvironment, default_home
 from comvla_sim.worlds.libero.errors import ProtocolError
 from comvla_sim.worlds.libero.expert import Expert
+from comvla_sim.worlds.libero.launch import Launch, launch_from_environment
 from comvla_sim.worlds.libero.process import SimulatorProcess
 from comvla_sim.worlds.libero.scene import Cameras, Reading, Scene
 
@@ -38,37 +34,6 @@ RENDERINGS = (FULL, PLAIN)
 # The hand's reach, angles of up to a turn, and fingers of a few centimetres.
 _PROPRIO_LOW = (-2.0, -2.0, -2.0, -7.0, -7.0, -7.0, -0.1, -0.1)
 _PROPRIO_HIGH = (2.0, 2.0, 3.0, 7.0, 7.0, 7.0, 0.1, 0.1)
-
-
-@dataclass(frozen=True)
-class Launch:
-    """How a simulator is started.
-
-    Attributes:
-        command: its command line.
-        variables: its environment variables.
-        assets: ``"authentic"`` or ``"stand-in"``.
-    """
-
-    command: list[str]
-    variables: Mapping[str, str]
-    assets: str
-
-
-def launch_from_environment(suite: str, image_size: int, *, render: bool, plain: bool) -> Launch:
-    """How to start the simulator of LIBERO's environment on this machine.
-
-    Raises:
-        DependencyError: the environment is not set up, or nothing can draw.
-        AssetsError: there are no assets.
-    """
-    environment = LiberoEnvironment(default_home())
-    environment.require()
-    assets = find_assets(environment.package(), environment.unpacked_assets)
-    options = Options(suite, str(assets.folder), image_size, render, plain)
-    return Launch(
-        environment.command(options.to_json()), environment.variables(render=render), assets.label
-    )
 
 
 class LiberoWorld(World):

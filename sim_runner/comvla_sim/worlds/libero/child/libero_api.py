@@ -12,12 +12,11 @@ import importlib.metadata
 import importlib.util
 import platform
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 _SCENE_PREFIX = re.compile(r"^[A-Z_]+_SCENE\d+_")
-_VERSIONS = ("hf-libero", "robosuite", "mujoco", "numpy", "bddl")
+_VERSIONS = ("hf-libero", "robosuite", "mujoco", "bddl")
 
 
 def use_assets(folder: str) -> None:
@@ -89,7 +88,8 @@ def observable(name: str, on_sample: Any, rate_hz: float) -> Any:
 def versions() -> dict[str, str]:
     """Versions of what decides how the simulation behaves."""
     found = {name: importlib.metadata.version(name) for name in _VERSIONS}
-    return {**found, "python": platform.python_version(), "platform": sys.platform}
+    found["simulator-numpy"] = importlib.metadata.version("numpy")
+    return {**found, "simulator-python": platform.python_version()}
 
 
 def load() -> None:

@@ -149,6 +149,7 @@ class Simulation:
         self._things = Things(self._env.env)
         # robosuite's own list grows with every reset that rebuilds the model; see _place_fixtures.
         self._samplers = list(self._env.env.object_property_initializers)
+        self._gripper_at_rest = np.array(self._env.env.robots[0].gripper.current_action)
         self._task = task
 
     def _place_fixtures(self, init_state: int) -> None:
@@ -167,6 +168,8 @@ class Simulation:
             env._reset_internal()
         env.object_property_initializers = self._samplers * (init_state + 2)
         self._env.reset()
+        # The evaluation rebuilds the gripper; here it would still be on its way of the last episode.
+        env.robots[0].gripper.current_action = self._gripper_at_rest.copy()
 
     def _advance(self, action: Any) -> None:
         self._observation, _, done, _ = self._env.step(np.asarray(action, np.float64))
