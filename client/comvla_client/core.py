@@ -226,6 +226,8 @@ class ClientCore:
         report = replace(
             self._timed(prepared, call_s), source=source, fallback_reason=reason, detail=detail
         )
+        if call_s == 0.0:  # no call was made, so nothing crossed the link
+            report = replace(report, tokens=0, payload_bytes=0, encoded_bytes=0, framed_bytes=0)
         return ActionChunk(actions=actions, planned=planned, report=report)
 
     def too_late(self, prepared: Prepared) -> TransportError:

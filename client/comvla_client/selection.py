@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, overload
 
 import numpy as np
 
+from comvla.errors import ObservationError
 from comvla_client.arrays import Array, NumpyArray, is_torch, to_numpy
 from comvla_client.scoring import Importance, hard_importance, soft_importance
 
@@ -89,7 +90,7 @@ def select(importance: Array | Importance, k: int, tie_break: TieBreak | None = 
 
 def _refuse_nan(found: bool) -> None:
     if found:
-        raise ValueError(
+        raise ObservationError(
             "importance holds NaN, so no order exists: the tokens or the queries are not finite; "
             "check the edge model's weights and its input"
         )

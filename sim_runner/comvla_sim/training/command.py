@@ -117,7 +117,7 @@ def _train(out: Path, data: Path, layouts: int, recipe: Recipe, threads: int) ->
 
     from comvla_sim.training.batches import Sampler
     from comvla_sim.training.demonstrations import Demonstrations
-    from comvla_sim.training.trainer import Trainer
+    from comvla_sim.training.trainer import Trainer, TrainingError
     from comvla_sim.worlds.tabletop import Tabletop
     from comvla_vla import save_policy
     from comvla_vla.presets import MINI_WORDS, mini
@@ -126,6 +126,12 @@ def _train(out: Path, data: Path, layouts: int, recipe: Recipe, threads: int) ->
 
     torch.set_num_threads(threads)
     train, held_out = Demonstrations(data / "train"), Demonstrations(data / "validation")
+    there = len(set(train.layout.tolist()))
+    if there != layouts:
+        raise TrainingError(
+            f"{data / 'train'} holds demonstrations of {there} layouts, --layouts asks for {layouts}: "
+            "choose another --data, or the number that is there"
+        )
     config, tokenizer = mini(), word_tokenizer(list(MINI_WORDS))
     table = {"tabletop": data_statistics(train)}
     bounds = pick_statistics(table, None, where=str(data))

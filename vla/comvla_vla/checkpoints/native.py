@@ -63,13 +63,30 @@ def write_around(folder: Path, checkpoint: Checkpoint, half: str, digest: str) -
 
 
 def publish(partial: Path, folder: Path) -> None:
-    """Puts a finished folder in its place in one move, readable for services under other accounts."""
+    """Puts a finished folder in its place, readable for services under other accounts.
+
+    An older checkpoint there is replaced, and kept until the new one stands.
+
+    Raises:
+        CheckpointError: the place is taken by something that is not a checkpoint.
+    """
+    if (
+        folder.exists()
+        and not (folder / CONFIG).is_file()
+        and (not folder.is_dir() or any(folder.iterdir()))
+    ):
+        raise CheckpointError(
+            f"{folder} holds something that is not a checkpoint: choose another folder"
+        )
     for file in partial.rglob("*"):
         if file.is_file():
             file.chmod(0o644)
+    replaced = folder.with_name(folder.name + ".replaced")
+    shutil.rmtree(replaced, ignore_errors=True)
     if folder.exists():
-        shutil.rmtree(folder)
+        folder.rename(replaced)
     partial.rename(folder)
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
