@@ -69,7 +69,8 @@ class Fake:
         }
         if BEHAVIOUR == "odd-scene":
             fields["things"] = [["bowl"]]
-        return self._message("ok", fields, {**reading.arrays, "points/bowl": points})
+        base = np.array([-0.66, 0, 0.9])
+        return self._message("ok", fields, {**reading.arrays, "points/bowl": points, "base": base})
 
     def step(self, request: Any) -> Any:
         if BEHAVIOUR == "dies":

@@ -24,6 +24,7 @@ _OPEN, _CLOSE = -1.0, 1.0
 
 _ABOVE_M = 0.08
 _CARRY_M = 0.10
+_DESCENT_M = 0.25
 _NEAR_M = 0.012
 _TOUCH_M = 0.006
 _TURN_DONE = 0.08
@@ -31,10 +32,12 @@ _GRASP_STEPS = 10
 _RELEASE_STEPS = 10
 _LOST_M = 0.05
 _STUCK_STEPS = 4
+_SETTLED_STEPS = 8
 _STUCK_M = 0.0008
 _PHASE_STEPS = 50
 _REST_M = 0.04
-_GAIN = 0.1
+_GAIN = 0.2
+_TURN_GAIN = 2.0
 
 # How the hand is turned when its fingers are along y and it points down.
 _REST = np.diag([1.0, -1.0, -1.0])
@@ -87,6 +90,7 @@ class Expert:
         self._goal = 0
         self._grasp: Grasp | None = None
         self._lift_z = 0.0
+        self._held = np.zeros(3)
         self._heights: list[float] = []
         self._bias = np.zeros(3)
         self._last_step = -1
@@ -184,8 +188,10 @@ class Expert:
         del reading, target
         assert self._grasp is not None
         goal = thing + self._grasp.offset
-        if hand[2] - goal[2] < _TOUCH_M or self._stuck(hand):
+        there = hand[2] - goal[2] < _TOUCH_M and np.linalg.norm(goal[:2] - hand[:2]) < _NEAR_M
+        if there or self._stuck(hand, _SETTLED_STEPS):
             self._lift_z = float(hand[2])
+            self._held = goal
             self._enter(Phase.GRASP, step)
         return _Motion(goal, 0.7, _OPEN)
 
@@ -195,7 +201,7 @@ class Expert:
         del reading, thing, target
         if step - self._began >= _GRASP_STEPS:
             self._enter(Phase.LIFT, step)
-        return _Motion(hand, 0.0, _CLOSE)
+        return _Motion(np.array([*self._held[:2], hand[2]]), 0.3, _CLOSE)
 
     def _lift(
         self, reading: Reading, hand: Float64s, thing: Float64s, target: Float64s, step: int
@@ -213,8 +219,11 @@ class Expert:
         self, reading: Reading, hand: Float64s, thing: Float64s, target: Float64s, step: int
     ) -> _Motion:
         del reading
-        height = max(self._lift_z, float(target[2])) + _CARRY_M
         error = target[:2] - thing[:2]
+        # High where it came from, low where it goes: a high hand is a stretched arm.
+        above = max(self._lift_z - float(target[2]), 0.0)
+        far = float(np.clip(np.linalg.norm(error) / _DESCENT_M, 0.0, 1.0))
+        height = float(target[2]) + above * far + _CARRY_M
         assert self._grasp is not None
         if np.linalg.norm(thing - hand) > np.linalg.norm(self._grasp.offset) + _LOST_M:
             self._again(step)
@@ -226,7 +235,7 @@ class Expert:
         self, reading: Reading, hand: Float64s, thing: Float64s, target: Float64s, step: int
     ) -> _Motion:
         del reading
-        if self._stuck(hand):
+        if self._stuck(hand, _STUCK_STEPS):
             self._enter(Phase.RELEASE, step)
         goal = np.array([*(hand[:2] + target[:2] - thing[:2]), hand[2] - 0.03])
         return _Motion(goal, 0.6, _CLOSE)
@@ -267,17 +276,18 @@ class Expert:
         }
         others = np.concatenate(list(corners.values())) if corners else np.empty((0, 3))
         thing = self._scene.things[name]
-        grasps = find_grasps(thing.points, matrix(reading.poses[thing.index, 3:]), others)
+        rotation = matrix(reading.poses[thing.index, 3:])
+        grasps = find_grasps(thing.points, rotation, others, self._scene.base - origin)
         if not grasps:
             raise ExpertError(f"{name} is too wide for the gripper, and has no rim")
         return grasps[self._attempt % len(grasps)]
 
-    def _stuck(self, hand: Float64s) -> bool:
-        """Whether the hand has stopped going down, because something bears it."""
+    def _stuck(self, hand: Float64s, steps: int) -> bool:
+        """Whether the hand has not come down for so many steps, because something bears it."""
         self._heights.append(float(hand[2]))
-        if len(self._heights) <= 2 * _STUCK_STEPS:
+        if len(self._heights) <= 2 * steps:
             return False
-        return self._heights[-1 - _STUCK_STEPS] - self._heights[-1] < _STUCK_STEPS * _STUCK_M
+        return self._heights[-1 - steps] - self._heights[-1] < steps * _STUCK_M
 
     def _wanted(self) -> Float64s:
         """The rotation (3, 3) that the hand should have."""
@@ -296,5 +306,5 @@ class Expert:
         if longest > motion.speed:
             move = move * (motion.speed / longest)
         turn = rotation_vector(self._wanted() @ matrix(reading.eef_quat).T) / _RADIANS_PER_ACTION
-        action = np.array([*move, *np.clip(turn, -0.5, 0.5), motion.gripper])
+        action = np.array([*move, *np.clip(_TURN_GAIN * turn, -0.5, 0.5), motion.gripper])
         return action.astype(np.float32)

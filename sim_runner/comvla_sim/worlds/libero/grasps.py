@@ -17,6 +17,7 @@ _FINGERTIP_M = 0.035
 _TOP_SLAB_M = 0.012
 _HOLLOW_RADIUS_M = 0.02
 _AMPLE_M = 0.01
+_COMFORTABLE_REACH_M = 0.68
 
 # The open Panda gripper as boxes (low, high): along the line through the fingers, across it, and
 # up, in metres from the point between the fingertips.
@@ -62,7 +63,9 @@ def is_hollow(points: Float64s) -> bool:
     return wide and bool(radii.min() > _HOLLOW_RADIUS_M)
 
 
-def find_grasps(points: Float64s, rotation: Float64s, others: Float64s) -> list[Grasp]:
+def find_grasps(
+    points: Float64s, rotation: Float64s, others: Float64s, base: Float64s
+) -> list[Grasp]:
     """Grasps of a thing, the most promising first.
 
     A hollow thing is pinched at its rim, one finger inside; anything else is held across its
@@ -72,16 +75,21 @@ def find_grasps(points: Float64s, rotation: Float64s, others: Float64s) -> list[
         points: (m, 3) points on its colliding parts in its own frame, in metres.
         rotation: (3, 3) of that frame.
         others: (n, 3) points on the other things, relative to its origin, with the world's axes.
+        base: (3,) where the arm stands, likewise.
     """
     grasps = (
         _rim_pinches(points, rotation, others)
         if is_hollow(points)
         else _holds(points @ rotation.T, others)
     )
-    # Ample room is enough; then little turning, which is quick and keeps the arm straight.
-    return sorted(
-        grasps, key=lambda g: (-min(g.clearance_m, _AMPLE_M), abs(turn_from_rest(g.direction)))
-    )
+    # Ample room is enough. Then not too far, where a stretched arm gets stuck, and little turning.
+    return sorted(grasps, key=lambda g: (-min(g.clearance_m, _AMPLE_M), _effort(g, base)))
+
+
+def _effort(grasp: Grasp, base: Float64s) -> float:
+    """How hard it is to reach: centimetres beyond a comfortable reach, and turning."""
+    beyond = float(np.linalg.norm((grasp.offset - base)[:2])) - _COMFORTABLE_REACH_M
+    return max(0.0, beyond) / 0.05 + abs(turn_from_rest(grasp.direction)) / np.pi
 
 
 def _rim_pinches(points: Float64s, rotation: Float64s, others: Float64s) -> list[Grasp]:

@@ -80,10 +80,12 @@ class Scene:
     Attributes:
         things: by name.
         goal: parts of the goal such as ``("on", "akita_black_bowl_1", "plate_1")``.
+        base: (3,) where the arm stands, in metres.
     """
 
     things: Mapping[str, Thing]
     goal: tuple[tuple[str, ...], ...]
+    base: Float64s
 
     @classmethod
     def from_message(cls, message: Message) -> Scene:
@@ -103,7 +105,7 @@ class Scene:
             goal = tuple(tuple(str(word) for word in part) for part in fields["goal"])
         except (KeyError, TypeError, ValueError) as error:
             raise ProtocolError(f"the simulator described no scene: {error!r}") from error
-        return cls(things, goal)
+        return cls(things, goal, _array(message, "base", (3,)))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Requests and the arrays and fields of their answers:
 
 | request | carries | answer |
 |---|---|---|
-| ``reset`` | fields ``task``, ``init_state`` | reading; fields ``things``, ``sizes``, ``goal``; ``points`` |
+| ``reset`` | fields ``task``, ``init_state`` | a reading and a scene |
 | ``step`` | array ``action`` (7,) | reading |
 | ``draw`` | | ``frames`` (2, S, S, 3) uint8 as the simulator gives them |
 | ``cameras`` | | ``positions`` (2, 3), ``rotations`` (2, 3, 3), ``fovy_deg`` (2,) |
@@ -13,7 +13,8 @@ Requests and the arrays and fields of their answers:
 
 The first message is sent unasked when the simulator is ready: fields ``tasks``, ``versions``.
 A *reading* is ``eef_pos`` (3,), ``eef_quat`` (4,) as x, y, z, w, ``gripper_qpos`` (2,), ``met``
-(goals,) bool and ``poses`` (things, 7): position and quaternion (x, y, z, w).
+(goals,) bool and ``poses`` (things, 7): position and quaternion (x, y, z, w). A *scene* is the fields
+``things``, ``sizes``, ``goal`` and the arrays ``points/NAME`` (m, 3) and ``base`` (3,).
 """
 
 from __future__ import annotations

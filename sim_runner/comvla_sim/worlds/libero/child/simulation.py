@@ -73,7 +73,8 @@ class Simulation:
         assert things is not None
         fields = {"things": things.names, "sizes": things.sizes(), "goal": self._goal()}
         points = {f"points/{name}": grid for name, grid in things.points().items()}
-        return Message("ok", fields, {**self._reading(), **points})
+        base = np.asarray(self._env.env.robots[0].base_pos, np.float64)
+        return Message("ok", fields, {**self._reading(), **points, "base": base})
 
     def step(self, request: Message) -> Message:
         """Executes one action (7,)."""
