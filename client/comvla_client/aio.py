@@ -78,6 +78,12 @@ class AsyncComVLAClient:
         """Longest that one step may take, in seconds."""
         return self._core.deadline_s
 
+    @property
+    def hold_action(self) -> Actions:
+        """The action (A,) that the robot holds with while it has nothing else to execute."""
+        held: Actions = self._core.queue.hold_action.copy()
+        return held
+
     async def connect(self) -> None:
         """Shakes hands with the server; a second time does nothing.
 

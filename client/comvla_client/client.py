@@ -111,6 +111,12 @@ class ComVLAClient:
         """Longest that one step may take, in seconds."""
         return self._core.deadline_s
 
+    @property
+    def hold_action(self) -> Actions:
+        """The action (A,) that the robot holds with while it has nothing else to execute."""
+        held: Actions = self._core.queue.hold_action.copy()
+        return held
+
     def step(
         self, obs: Observation, instr: str, snr: float | SnrReading | None = None
     ) -> ActionChunk:
