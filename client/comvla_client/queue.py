@@ -67,13 +67,18 @@ class ActionQueue:
         self._started = self.execute
         self._pending = deque(self._chunk[: self.execute])
 
-    def fall_back(self) -> tuple[Actions, int, Source]:
+    def fall_back(self, *, hold: bool = False) -> tuple[Actions, int, Source]:
         """What to do without an answer.
+
+        Args:
+            hold: stand still, whatever the last chunk still has.
 
         Returns:
             (H, A) actions, how many leading rows come from the last chunk, and where they come from.
             It is taken as given that the robot executes ``execute`` rows before it asks again.
         """
+        if hold:
+            self._started = self.horizon
         rest = self._nothing_yet[None][:0] if self._chunk is None else self._chunk[self._started :]
         self._started += self.execute
         actions = np.tile(self.hold_action, (self.horizon, 1))

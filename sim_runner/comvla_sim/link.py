@@ -165,15 +165,25 @@ class EnforcedLink:
         response.progressive = True  # it is this link that takes the pieces
         return response
 
-    def infer(
-        self, request: InferRequest, timeout_s: float, window_s: float | None = None
+    def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
+        """Carries what fits of a request into this period, and the answer back.
+
+        Raises:
+            TransportError: ``DEADLINE_EXCEEDED`` when no token arrived whole in time, and whatever
+                the wrapped transport raises.
+        """
+        return self.infer_within(request, timeout_s, self._link.window_s)
+
+    def infer_within(
+        self, request: InferRequest, timeout_s: float, window_s: float
     ) -> InferResponse:
-        """Carries what fits of a request, and the answer back.
+        """Carries what fits of a request into a window of some periods, and the answer back.
 
         Args:
             request: the request.
             timeout_s: for the wrapped transport, on the wall clock.
-            window_s: seconds in which the payload has to cross; default: this period.
+            window_s: seconds in which the payload has to cross. With ``mode="queue"`` it is the
+                robot's patience that counts.
 
         Raises:
             TransportError: ``DEADLINE_EXCEEDED`` when no token arrived whole in time, and whatever
@@ -229,9 +239,7 @@ class EnforcedLink:
         """Closes the wrapped transport."""
         self._transport.close()
 
-    def _span(self, window_s: float | None) -> int:
-        if window_s is None:
-            return 1
+    def _span(self, window_s: float) -> int:
         return periods_of(window_s, self._link.period_s, self._link.reserve_s)
 
     def _note(
