@@ -71,7 +71,18 @@ class Progressive(BasePolicy):
         )
 
     def learn(self, outcome: Outcome) -> None:
-        """Learns the goodput. A payload that arrived whole says only that more was possible."""
-        if outcome.offered_tokens:
-            grown = 2.0 if outcome.arrived_tokens >= outcome.offered_tokens else 1.0
-            self._goodput_bits.append(grown * outcome.arrived_bits / outcome.periods)
+        """Learns the goodput, where it is not known from an SNR.
+
+        A payload that arrived whole says only that more was possible, one without an answer only
+        that it was too much. After a step that sent nothing the next dares twice as much, because
+        nothing else could tell that the link is back.
+        """
+        measured = outcome.arrived_bits / outcome.periods
+        if not outcome.answered:
+            if not self._goodput_bits:
+                return
+            usual = sum(self._goodput_bits) / len(self._goodput_bits)
+            measured = 0.5 * usual if outcome.offered_tokens else 2.0 * usual
+        elif outcome.arrived_tokens >= outcome.offered_tokens:
+            measured *= 2.0
+        self._goodput_bits.append(measured)
