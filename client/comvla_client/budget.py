@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -66,7 +67,8 @@ class LinkProfile:
         Raises:
             LinkError: NaN or +inf.
         """
-        return self._bits_in(_as_written(self.period_s)) * _log2_one_plus(check_snr_db(snr_db))
+        bits = _bits_in(self.efficiency, self.bandwidth_hz, self.period_s, 0.0, 1)
+        return bits * _log2_one_plus(check_snr_db(snr_db))
 
     def window_bits(self, snr_db: float, periods: int = 1) -> float:
         """Bits that cross before the reserve begins: the capacity that budgets divide into tokens.
@@ -78,17 +80,18 @@ class LinkProfile:
         Raises:
             LinkError: NaN or +inf.
         """
-        seconds = periods * _as_written(self.period_s) - _as_written(self.reserve_s)
-        return self._bits_in(seconds) * _log2_one_plus(check_snr_db(snr_db))
-
-    def _bits_in(self, seconds: Fraction) -> float:
-        """η · W · t, the bits of one bit per second and hertz."""
-        return float(_as_written(self.efficiency) * _as_written(self.bandwidth_hz) * seconds)
+        bits = _bits_in(self.efficiency, self.bandwidth_hz, self.period_s, self.reserve_s, periods)
+        return bits * _log2_one_plus(check_snr_db(snr_db))
 
 
-def _as_written(value: float) -> Fraction:
+@functools.lru_cache(maxsize=64)
+def _bits_in(
+    efficiency: float, bandwidth_hz: float, period_s: float, reserve_s: float, periods: int
+) -> float:
+    """η · W · t, the bits of one bit per second and hertz."""
     # The decimals as they were written: .29 · 100 · 1 are 29 bits, not 28.999999999999996.
-    return Fraction(repr(float(value)))
+    written = [Fraction(repr(float(v))) for v in (efficiency, bandwidth_hz, period_s, reserve_s)]
+    return float(written[0] * written[1] * (periods * written[2] - written[3]))
 
 
 def check_snr_db(snr_db: float) -> float:

@@ -11,7 +11,6 @@ import math
 from itertools import pairwise
 
 from comvla.codec.accounting import encoded_bytes
-from comvla.codec.layout import header_bytes
 from comvla.codec.wire import HTTP2_END_BYTES, varint_bytes, wire_bytes
 from comvla.errors import CodecError
 
@@ -33,8 +32,8 @@ def tokens_per_piece(
     Raises:
         CodecError: see :func:`comvla.codec.encoded_bytes`.
     """
-    record = encoded_bytes(1, token_dim, quantization, num_towers=num_towers)
-    record -= header_bytes(num_towers)
+    start = encoded_bytes(0, token_dim, quantization, num_towers=num_towers)
+    record = encoded_bytes(1, token_dim, quantization, num_towers=num_towers) - start
     best = math.sqrt(2.0 * PIECE_OVERHEAD_BYTES * max(0.0, link_bytes))
     return max(1, round(best / record))
 
@@ -67,8 +66,9 @@ def piece_ends(
             f"expected k, first_tokens and piece_tokens of at least 1, got {k}, {first_tokens} and "
             f"{piece_tokens}"
         )
-    counts = [*range(min(k, first_tokens), k, piece_tokens), k]
-    return [encoded_bytes(n, token_dim, quantization, num_towers=num_towers) for n in counts]
+    start = encoded_bytes(0, token_dim, quantization, num_towers=num_towers)
+    record = encoded_bytes(1, token_dim, quantization, num_towers=num_towers) - start
+    return [start + n * record for n in (*range(min(k, first_tokens), k, piece_tokens), k)]
 
 
 def progressive_head_bytes(request_bytes: int, *, window_s: float, min_tokens: int) -> int:
