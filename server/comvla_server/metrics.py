@@ -81,7 +81,7 @@ class Metrics:
         self.streams = Counter(
             "comvla_progressive_streams",
             "Payloads that came in pieces, by how the stream ended: whole, closed by the robot, "
-            "window over, or refused.",
+            "window over, repeat of a recorded step, or refused.",
             ["ending"],
             registry=self.registry,
         )

@@ -17,8 +17,8 @@ from comvla_server.refusals import Reason, Refusal
 MAX_WINDOW_S = 10.0
 """Longest window that a head may ask for: a stream holds a call open without any compute."""
 
-Ending = Literal["whole", "closed", "window", "refused"]
-ENDINGS: tuple[Ending, ...] = ("whole", "closed", "window", "refused")
+Ending = Literal["whole", "closed", "window", "repeat", "refused"]
+ENDINGS: tuple[Ending, ...] = ("whole", "closed", "window", "repeat", "refused")
 
 _HANG_UP_S = 0.001
 

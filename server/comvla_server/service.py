@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +13,10 @@ import grpc
 from comvla import codec, handshake
 from comvla.errors import CodecError
 from comvla.v1 import policy_pb2, policy_pb2_grpc
+from comvla_server.accounts import Answered, CallAccounts
 from comvla_server.batcher import Batcher
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle
-from comvla_server.log_throttle import LogThrottle
 from comvla_server.memory import BytesInFlight, Lease
 from comvla_server.metrics import Metrics
 from comvla_server.piecewise import PieceReader
@@ -26,12 +25,6 @@ from comvla_server.settings import ServerSettings
 from comvla_server.tickets import Answer
 from comvla_server.validation import Validator, content_digest
 from comvla_server.version import server_version
-from comvla_server.wording import shown
-
-_log = logging.getLogger(__name__)
-
-# A robot's own deadline began when it sent: it hangs up earlier than the deadline seen from here.
-_TRANSIT_S = 0.05
 
 STATUS = {
     Reason.MALFORMED: grpc.StatusCode.INVALID_ARGUMENT,
@@ -48,10 +41,6 @@ STATUS = {
     Reason.DRAINING: grpc.StatusCode.UNAVAILABLE,
     Reason.MODEL: grpc.StatusCode.INTERNAL,
 }
-
-
-Answered = tuple[policy_pb2.InferResponse, bool]
-"""A response, and whether it repeats an earlier one."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +63,6 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
     Attributes:
         runtime: the loaded model behind its queue, None while loading.
-        idle: set while no Infer call is open.
     """
 
     def __init__(
@@ -85,16 +73,18 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.runtime: Runtime | None = None
-        self.idle = asyncio.Event()
-        self.idle.set()
-        self._calls = 0
         self._lifecycle = lifecycle
         self._metrics = metrics
         self._settings = settings
         self._clock = clock
-        self._throttle = LogThrottle(clock)
+        self._accounts = CallAccounts(metrics, settings.default_deadline_s, clock)
         self._in_flight = BytesInFlight(settings.max_bytes_in_flight)
         metrics.watch_bytes(lambda: self._in_flight.held)
+
+    @property
+    def idle(self) -> asyncio.Event:
+        """Set while no call for actions is open."""
+        return self._accounts.idle
 
     async def GetModel(
         self, request: policy_pb2.GetModelRequest, context: grpc.aio.ServicerContext[Any, Any]
@@ -151,7 +141,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 lease.take(request.ByteSize())
                 return await self._answer(request, lease, started_s, deadline_s)
 
-        return await self._accounted(request, time_remaining_s, work)
+        return await self._accounts.run(request, time_remaining_s, work)
 
     async def infer_progressive(
         self, messages: AsyncIterator[Any], time_remaining_s: float | None
@@ -174,49 +164,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             with self._in_flight.lease() as lease:
                 return await self._answer_stream(request, messages, lease, started_s, deadline_s)
 
-        return await self._accounted(request, time_remaining_s, work)
-
-    async def _accounted(
-        self,
-        request: policy_pb2.InferRequest,
-        time_remaining_s: float | None,
-        work: Callable[[float, float], Awaitable[Answered]],
-    ) -> policy_pb2.InferResponse:
-        """Does the work of one call, and counts and logs how it ended."""
-        started_s = self._clock()
-        deadline_s = started_s + (
-            self._settings.default_deadline_s if time_remaining_s is None else time_remaining_s
-        )
-        outcome = Reason.CANCELLED.value
-        self._calls += 1
-        self.idle.clear()
-        try:
-            response, repeat = await work(started_s, deadline_s)
-            outcome = "repeat" if repeat else "ok"
-            return response
-        except Refusal as refusal:
-            outcome = refusal.reason.value
-            self._note_refusal(request, refusal)
-            raise
-        except asyncio.CancelledError:
-            if self._clock() >= deadline_s - _TRANSIT_S:
-                outcome = Reason.DEADLINE.value
-            self._metrics.requests_dropped.labels(outcome).inc()
-            raise
-        except Exception as error:
-            outcome = Reason.MODEL.value
-            _log.exception("a request broke the server's own code")
-            self._metrics.requests_dropped.labels(outcome).inc()
-            raise Refusal(
-                Reason.MODEL,
-                f"expected actions, the server failed with {type(error).__name__}: "
-                "its log says more, please report it",
-            ) from error
-        finally:
-            self._calls -= 1
-            if not self._calls:
-                self.idle.set()
-            self._metrics.step_duration.labels(outcome).observe(self._clock() - started_s)
+        return await self._accounts.run(request, time_remaining_s, work)
 
     def note_malformed(self, size_bytes: int) -> Refusal:
         """Counts bytes that are no InferRequest, and says so."""
@@ -226,7 +174,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             "build requests from the contract's generated code",
         )
         self._count_message(size_bytes)
-        self._note_refusal(policy_pb2.InferRequest(), refusal)
+        self._accounts.note_refusal(policy_pb2.InferRequest(), refusal)
         return refusal
 
     def _require_runtime(self) -> Runtime:
@@ -256,13 +204,15 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             request.CopyFrom(head.request)
             runtime.validator.check_head(request)
             digest = content_digest(request)
-            if runtime.batcher.find(request.session_id, request.step, digest) is None:
+            if runtime.batcher.find(request.session_id, request.step, digest) is not None:
+                reader.ending = "repeat"
+            else:
                 headed_s = self._clock()
                 window_s = min(head.window_s, deadline_s - headed_s)
                 request.payload = await reader.collect(window_s, head.min_tokens)
                 self._metrics.step_phase.labels("collect").observe(self._clock() - headed_s)
         finally:
-            self._count_payload(bytes(reader.payload))
+            self._count_payload(reader.payload)
             self._metrics.streams.labels(reader.ending).inc()
         return await self._answer(request, lease, started_s, deadline_s, digest)
 
@@ -328,7 +278,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         """What crossed the link, whatever becomes of it."""
         self._metrics.tx_framed_bytes.inc(codec.wire_bytes(size_bytes))
 
-    def _count_payload(self, payload: bytes) -> None:
+    def _count_payload(self, payload: bytes | bytearray) -> None:
         metrics = self._metrics
         metrics.tx_encoded_bytes.inc(len(payload))
         try:
@@ -340,22 +290,6 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         metrics.request_tokens.observe(tokens)
         paper_bytes = codec.payload_bytes(tokens, header.token_dim, header.quantization)
         metrics.tx_payload_bytes.inc(paper_bytes)
-
-    def _note_refusal(self, request: policy_pb2.InferRequest, refusal: Refusal) -> None:
-        self._metrics.requests_dropped.labels(refusal.reason.value).inc()
-        suppressed = self._throttle.allow(refusal.reason.value)
-        if suppressed is None:
-            return
-        _log.info(
-            "refused: %s",
-            refusal.message,
-            extra={
-                "reason": refusal.reason.value,
-                "session": shown(request.session_id),
-                "step": request.step,
-                "suppressed": suppressed,
-            },
-        )
 
 
 def _whole_tokens(header: codec.PayloadHeader, length: int) -> int:

@@ -173,7 +173,7 @@ def test_too_few_tokens_are_refused_and_cost_no_compute(robot: Robot, cloud: Stu
 
 
 def test_a_repeat_is_answered_from_the_record_whatever_arrived_of_it(
-    robot: Robot, cloud: StubCloud
+    robot: Robot, server: BackgroundServer, cloud: StubCloud
 ) -> None:
     request = message(k=K)
     ends = token_ends(K)
@@ -185,6 +185,7 @@ def test_a_repeat_is_answered_from_the_record_whatever_arrived_of_it(
         assert list(came.actions) == list(first.actions)
         assert came.tokens_used == 4
     assert len(cloud.batches) == 1
+    assert counted(server, 'progressive_streams_total{ending="repeat"}') == 3.0
 
 
 def test_two_streams_of_one_step_share_one_answer(robot: Robot, cloud: StubCloud) -> None:
