@@ -9,7 +9,12 @@ from comvla.v1.policy_pb2 import GetModelResponse
 
 
 def check_server(
-    response: GetModelResponse, edge: ModelInfo, *, quantization: str, most_tokens: int
+    response: GetModelResponse,
+    edge: ModelInfo,
+    *,
+    quantization: str,
+    most_tokens: int,
+    progressive: bool = False,
 ) -> ModelInfo:
     """Compares the server's model and limits with what this robot is going to send.
 
@@ -18,6 +23,7 @@ def check_server(
         edge: the robot's half.
         quantization: how the robot codes token values.
         most_tokens: the most tokens that any of its requests may hold.
+        progressive: whether the robot sends its payloads in pieces.
 
     Returns:
         The model that the server runs.
@@ -33,6 +39,11 @@ def check_server(
     difference = handshake.quantization_mismatch(quantization, offered)
     if difference is not None:
         raise HandshakeError(difference)
+    if progressive and not response.progressive:
+        raise HandshakeError(
+            f"client sends payloads in pieces, server {response.server_version or 'of no version'} "
+            "has no InferProgressive: update the server, or choose sending='margin'"
+        )
     largest_bytes = codec.request_wire_bytes(
         most_tokens, edge.token_dim, quantization, num_towers=len(edge.tower_dims)
     )

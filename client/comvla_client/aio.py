@@ -17,6 +17,7 @@ from comvla_client.observation import Observation
 from comvla_client.queue import Actions
 from comvla_client.report import ActionChunk
 from comvla_client.selection import Selector
+from comvla_client.sending import SendingPolicy
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading
 from comvla_client.transport_aio import AsyncTransport, GrpcAioTransport
@@ -39,6 +40,7 @@ class AsyncComVLAClient:
         quantization: str = "int8",
         selector: str | Selector = "hard_voting",
         budget: Budget = "paper",
+        sending: str | SendingPolicy = "paper",
         snr: SnrInput | None = None,
         deadline_s: float | None = None,
         min_tokens: int = 1,
@@ -54,6 +56,7 @@ class AsyncComVLAClient:
             quantization=quantization,
             selector=selector,
             budget=budget,
+            sending=sending,
             snr=snr,
             deadline_s=deadline_s,
             min_tokens=min_tokens,
@@ -67,6 +70,7 @@ class AsyncComVLAClient:
         self._connected = False
         self._closed = False
         self._transport = GrpcAioTransport(target) if isinstance(target, str) else target
+        self._core.check_transport(self._transport)
 
     @property
     def info(self) -> ModelInfo:
@@ -77,6 +81,12 @@ class AsyncComVLAClient:
     def deadline_s(self) -> float:
         """Longest that one step may take, in seconds."""
         return self._core.deadline_s
+
+    @property
+    def hold_action(self) -> Actions:
+        """The action (A,) that the robot holds with while it has nothing else to execute."""
+        held: Actions = self._core.queue.hold_action.copy()
+        return held
 
     async def connect(self) -> None:
         """Shakes hands with the server; a second time does nothing.
@@ -170,7 +180,7 @@ class AsyncComVLAClient:
             return self._core.fail(prepared, self._core.too_late(prepared))
         sent = time.perf_counter()
         try:
-            response = await self._transport.infer(prepared.request, remaining_s)
+            response = await self._core.call(self._transport, prepared, remaining_s)
         except TransportError as error:
             self._check_open()
             return self._core.fail(prepared, error, time.perf_counter() - sent)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -19,6 +21,9 @@ class LinkProfile:
         period_s: T, the control period in which a payload has to arrive, in seconds.
         efficiency: η in (0, 1], what share of the Shannon capacity becomes tokens. The paper never
             states it; 0.38 fits its two published points (Object suite, Rician κ = 3, mean 5 dB).
+        reserve_s: what is kept of the period for the round trip and the computing in the cloud, so
+            that the *answer* can arrive within the period, in seconds. Budgets use the rest of the
+            period; at 0, the default, they are Eq. (4) as the paper has it.
 
     Raises:
         LinkError: a value that is not finite or out of range.
@@ -27,6 +32,7 @@ class LinkProfile:
     bandwidth_hz: float = 20e6
     period_s: float = 0.05
     efficiency: float = 0.38
+    reserve_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("bandwidth_hz", "period_s"):
@@ -41,6 +47,16 @@ class LinkProfile:
                 f"expected an efficiency in (0, 1], got {self.efficiency!r}: it is the share of the "
                 "Shannon capacity that becomes tokens, 0.38 where nothing better is known"
             )
+        if not _is_finite_number(self.reserve_s) or not 0 <= self.reserve_s < self.period_s:
+            raise LinkError(
+                f"expected a reserve_s of at least 0 and below the period of {self.period_s} s, got "
+                f"{self.reserve_s!r}: it is the part of the period in which nothing is sent"
+            )
+
+    @property
+    def window_s(self) -> float:
+        """The part of the period in which a payload may cross, in seconds."""
+        return self.period_s - self.reserve_s
 
     def capacity_bits(self, snr_db: float) -> float:
         """C_link = η · W · T · log2(1 + SNR), Eq. (1): bits that cross in one period.
@@ -51,13 +67,31 @@ class LinkProfile:
         Raises:
             LinkError: NaN or +inf.
         """
-        # The decimals as they were written: .29 · 100 · 1 are 29 bits, not 28.999999999999996.
-        bits_per_efficiency = float(
-            Fraction(repr(float(self.efficiency)))
-            * Fraction(repr(float(self.bandwidth_hz)))
-            * Fraction(repr(float(self.period_s)))
-        )
-        return bits_per_efficiency * _log2_one_plus(check_snr_db(snr_db))
+        bits = _bits_in(self.efficiency, self.bandwidth_hz, self.period_s, 0.0, 1)
+        return bits * _log2_one_plus(check_snr_db(snr_db))
+
+    def window_bits(self, snr_db: float, periods: int = 1) -> float:
+        """Bits that cross before the reserve begins: the capacity that budgets divide into tokens.
+
+        Args:
+            snr_db: signal-to-noise ratio in dB; −inf means no link and gives 0.
+            periods: control periods that the payload may take; only the last has a reserve.
+
+        Raises:
+            LinkError: NaN or +inf.
+        """
+        bits = _bits_in(self.efficiency, self.bandwidth_hz, self.period_s, self.reserve_s, periods)
+        return bits * _log2_one_plus(check_snr_db(snr_db))
+
+
+@functools.lru_cache(maxsize=64)
+def _bits_in(
+    efficiency: float, bandwidth_hz: float, period_s: float, reserve_s: float, periods: int
+) -> float:
+    """η · W · t, the bits of one bit per second and hertz."""
+    # The decimals as they were written: .29 · 100 · 1 are 29 bits, not 28.999999999999996.
+    written = [Fraction(repr(float(v))) for v in (efficiency, bandwidth_hz, period_s, reserve_s)]
+    return float(written[0] * written[1] * (periods * written[2] - written[3]))
 
 
 def check_snr_db(snr_db: float) -> float:
@@ -100,7 +134,7 @@ def token_budget(snr_db: float, link: LinkProfile, bits_per_token: float) -> int
             f"expected bits_per_token > 0, got {bits_per_token!r}: it is token_dim * bits_per_value"
         )
     # Floor division of floats is exact, where dividing first may round up to the next integer.
-    return int(link.capacity_bits(snr_db) // bits_per_token)
+    return int(link.window_bits(snr_db) // bits_per_token)
 
 
 def framed_token_budget(
@@ -148,7 +182,7 @@ def framed_token_budget(
     """
     if not 0.0 <= margin < 1.0:
         raise LinkError(f"expected a margin in [0, 1), got {margin!r}: a share of the capacity")
-    room_bytes = (1.0 - margin) * link.capacity_bits(snr_db) / 8.0
+    room_bytes = (1.0 - margin) * link.window_bits(snr_db) / 8.0
 
     def fits(k: int) -> bool:
         return room_bytes >= codec.request_wire_bytes(
@@ -166,8 +200,13 @@ def framed_token_budget(
         )
 
     # Framing only adds, so the paper's budget bounds this one from above.
+    bits_per_token = token_dim * codec.bits_per_value(quantization)
+    return largest_that(fits, token_budget(snr_db, link, bits_per_token))
+
+
+def largest_that(fits: Callable[[int], bool], high: int) -> int:
+    """The largest k in 1 to ``high`` that fits, 0 where none does; what fits, fits when smaller."""
     low = 0
-    high = token_budget(snr_db, link, token_dim * codec.bits_per_value(quantization))
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if fits(middle) else (low, middle - 1)

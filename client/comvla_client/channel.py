@@ -104,6 +104,11 @@ def transport_error(error: grpc.RpcError) -> TransportError:
     return TransportError(code.name, details or "no details")
 
 
+def is_silence(error: TransportError) -> bool:
+    """Whether nobody spoke in time. A server that says so itself is there, and late."""
+    return error.code == "DEADLINE_EXCEEDED" and error.message.startswith("Deadline Exceeded")
+
+
 def unanswered(timeout_s: float) -> TransportError:
     """The error of a call that the robot stopped waiting for."""
     return TransportError("DEADLINE_EXCEEDED", f"no answer within {timeout_s:.3f} s")

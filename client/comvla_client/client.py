@@ -17,6 +17,7 @@ from comvla_client.observation import Observation
 from comvla_client.queue import Actions
 from comvla_client.report import ActionChunk
 from comvla_client.selection import Selector
+from comvla_client.sending import SendingPolicy
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading
 from comvla_client.transport import GrpcTransport, Transport
@@ -42,6 +43,10 @@ class ComVLAClient:
         selector: ranking of tokens, by name (:data:`comvla_client.selection.SELECTORS`) or your own.
         budget: ``"paper"`` sizes payloads by Eq. (4), ``"framed"`` by all bytes that cross the wire;
             a number sends that many tokens whatever the SNR.
+        sending: how much is sent when, by name (:data:`comvla_client.sending.POLICIES`) or an object
+            of your own: ``"paper"`` takes the reported SNR at its word, ``"margin"`` sends what very
+            likely fits, given the report's age, ``"progressive"`` sends the most important tokens
+            first until the window ends, ``"floor"`` sends nothing where it would be too little.
         snr: where the SNR in dB comes from when ``step`` is not told: a number, a function, or an
             object with ``read()``.
         deadline_s: longest that one ``step`` may take, edge half included, in seconds. Default: the
@@ -69,6 +74,7 @@ class ComVLAClient:
         quantization: str = "int8",
         selector: str | Selector = "hard_voting",
         budget: Budget = "paper",
+        sending: str | SendingPolicy = "paper",
         snr: SnrInput | None = None,
         deadline_s: float | None = None,
         min_tokens: int = 1,
@@ -84,6 +90,7 @@ class ComVLAClient:
             quantization=quantization,
             selector=selector,
             budget=budget,
+            sending=sending,
             snr=snr,
             deadline_s=deadline_s,
             min_tokens=min_tokens,
@@ -96,6 +103,7 @@ class ComVLAClient:
         self._closed = False
         self._transport = GrpcTransport(target) if isinstance(target, str) else target
         try:
+            self._core.check_transport(self._transport)
             self._shake_hands(connect_timeout_s)
         except BaseException:
             self.close()
@@ -110,6 +118,12 @@ class ComVLAClient:
     def deadline_s(self) -> float:
         """Longest that one step may take, in seconds."""
         return self._core.deadline_s
+
+    @property
+    def hold_action(self) -> Actions:
+        """The action (A,) that the robot holds with while it has nothing else to execute."""
+        held: Actions = self._core.queue.hold_action.copy()
+        return held
 
     def step(
         self, obs: Observation, instr: str, snr: float | SnrReading | None = None
@@ -199,7 +213,7 @@ class ComVLAClient:
             return self._core.fail(prepared, self._core.too_late(prepared))
         sent = time.perf_counter()
         try:
-            response = self._transport.infer(prepared.request, remaining_s)
+            response = self._core.call(self._transport, prepared, remaining_s)
         except TransportError as error:
             self._check_open()
             return self._core.fail(prepared, error, time.perf_counter() - sent)

@@ -12,6 +12,7 @@ import secrets
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +28,10 @@ from comvla_client.observation import Observation, check_instruction, check_obse
 from comvla_client.queue import ActionQueue, Actions
 from comvla_client.report import PHASES, ActionChunk, FallbackReason, Load, StepReport
 from comvla_client.selection import Selector, make_selector
+from comvla_client.sending import Outcome, Plan, SendingPolicy, Situation, make_policy
 from comvla_client.sizing import Budget, TokenSizer
 from comvla_client.snr import SnrInput, SnrReading, as_reading, as_source
+from comvla_client.streaming import PayloadStream
 from comvla_client.uplink import TokenUplink
 
 WIND_UP_S = 0.002
@@ -42,16 +45,20 @@ class Prepared:
     """A step between its request and its answer.
 
     Attributes:
-        request: what to send; None when the link carries nothing.
+        request: what to send; None when nothing is sent.
         report: the account so far.
         started: when the step began, on ``time.perf_counter``.
         deadline: when its call has to be over, on the same clock.
+        plan: what the policy of sending decided.
+        stream: the payload in pieces; ``request`` then has none. None where it goes whole.
     """
 
     request: InferRequest | None
     report: StepReport
     started: float
     deadline: float
+    plan: Plan
+    stream: PayloadStream | None = None
 
     def remaining_s(self) -> float:
         """Seconds left for the call; negative when the edge half alone took too long."""
@@ -69,6 +76,7 @@ class ClientCore:
         quantization: str = "int8",
         selector: str | Selector = "hard_voting",
         budget: Budget = "paper",
+        sending: str | SendingPolicy = "paper",
         snr: SnrInput | None = None,
         deadline_s: float | None = None,
         min_tokens: int = 1,
@@ -93,6 +101,7 @@ class ClientCore:
             sends_all=ranks.sends_all,
             min_tokens=min_tokens,
         )
+        self.sending = make_policy(sending)
         self._uplink = TokenUplink(edge, ranks, quantization)
         self._snr = None if snr is None else as_source(snr)
         self._seed = seed
@@ -110,6 +119,7 @@ class ClientCore:
         self._episode += 1
         self._step = 0
         self.queue.clear()
+        self.sending.reset()
         self._uplink.reset()
 
     def accept_server(self, response: GetModelResponse) -> ModelInfo:
@@ -123,6 +133,7 @@ class ClientCore:
             self.info,
             quantization=self._quantization,
             most_tokens=self._sizer.most_tokens,
+            progressive=self.sending.progressive,
         )
 
     def prepare(
@@ -138,35 +149,52 @@ class ClientCore:
         queries = self._uplink.queries(check_instruction(instruction))
         reading = self._read_snr(snr)
         request = self._blank_request(instruction, checked.proprio.tolist(), reading)
-        size = self._sizer.size(reading, request)
-        report = StepReport(
-            session=self.session,
-            step=self._step,
-            snr_db=None if reading is None else reading.snr_db,
-            snr_age_s=None if reading is None else reading.age_s,
-            capacity_bits=size.capacity_bits,
-            token_budget=size.budget,
-        )
+        plan = self._plan(reading, request)
+        report = self._opened(reading, request, plan)
         deadline = started + self.deadline_s - min(WIND_UP_S, 0.1 * self.deadline_s)
         rng = np.random.default_rng([self._seed, self._episode, self._step])
         self._step += 1
-        if size.count == 0:
-            return Prepared(None, report, started, deadline)
-        uplink = self._uplink.compress(checked, queries, size.count, rng)
-        request.payload = uplink.payload
+        if plan.count == 0:
+            return Prepared(None, report, started, deadline, plan)
+        uplink = self._uplink.compress(checked, queries, plan.count, rng)
+        stream = None
+        if plan.progressive:
+            stream = self._stream(request, uplink.payload, len(uplink.positions), plan)
+        else:
+            request.payload = uplink.payload
         report = replace(
             report,
-            tokens=len(uplink.positions),
             positions=uplink.positions,
-            payload_bytes=codec.payload_bytes(
-                len(uplink.positions), self.info.token_dim, self._quantization
-            ),
-            encoded_bytes=len(uplink.payload),
-            framed_bytes=codec.wire_bytes(request.ByteSize()),
             timings_s=dict.fromkeys(PHASES, 0.0) | uplink.timings_s,
             edge_flops=uplink.flops,
         )
-        return Prepared(request, report, started, deadline)
+        return Prepared(request, report, started, deadline, plan, stream)
+
+    def call(self, transport: Any, prepared: Prepared, timeout_s: float) -> Any:
+        """Hands a step to a transport in the form that its plan asks for; the transport's result.
+
+        Args:
+            transport: synchronous or asynchronous, checked by :meth:`check_transport`.
+            prepared: a step with a request.
+            timeout_s: seconds left for the call.
+        """
+        if prepared.stream is not None:
+            return transport.infer_progressive(prepared.stream, timeout_s)
+        if prepared.plan.periods > 1 and hasattr(transport, "infer_within"):
+            return transport.infer_within(prepared.request, timeout_s, prepared.report.window_s)
+        return transport.infer(prepared.request, timeout_s)
+
+    def check_transport(self, transport: object) -> None:
+        """Whether a transport can carry what the policy of sending will ask of it.
+
+        Raises:
+            ValueError: the policy sends pieces, and it takes none.
+        """
+        if self.sending.progressive and not hasattr(transport, "infer_progressive"):
+            raise ValueError(
+                f"sending={self.sending.name!r} needs a transport with infer_progressive(stream, "
+                f"timeout_s), {type(transport).__name__} has none: add it, or choose another policy"
+            )
 
     def complete(self, prepared: Prepared, response: InferResponse, call_s: float) -> ActionChunk:
         """The chunk of an answer.
@@ -187,7 +215,7 @@ class ClientCore:
         self.queue.accept(actions)
         timings = response.timings
         report = replace(
-            self._timed(prepared, call_s),
+            self._closed(prepared, call_s, response.tokens_used),
             source="cloud",
             tokens_used=response.tokens_used,
             server_timings_s={
@@ -221,13 +249,14 @@ class ClientCore:
                 step can mend, in the server's words.
         """
         reason: FallbackReason = "no_link" if error is None else fallback_reason(error)
-        detail = "the link carries too few tokens" if error is None else error.message
-        actions, planned, source = self.queue.fall_back()
+        detail = prepared.plan.detail if error is None else error.message
+        actions, planned, source = self.queue.fall_back(hold=prepared.plan.hold)
         report = replace(
-            self._timed(prepared, call_s), source=source, fallback_reason=reason, detail=detail
+            self._closed(prepared, call_s),
+            source=source,
+            fallback_reason=reason,
+            detail=detail,
         )
-        if call_s == 0.0:  # no call was made, so nothing crossed the link
-            report = replace(report, tokens=0, payload_bytes=0, encoded_bytes=0, framed_bytes=0)
         return ActionChunk(actions=actions, planned=planned, report=report)
 
     def too_late(self, prepared: Prepared) -> TransportError:
@@ -243,10 +272,104 @@ class ClientCore:
         """The next action (A,) of the current chunk, or None when it is time for a step."""
         return self.queue.pop()
 
-    def _timed(self, prepared: Prepared, call_s: float) -> StepReport:
-        total_s = time.perf_counter() - prepared.started
-        timings_s = prepared.report.timings_s | {"call": call_s, "total": total_s}
-        return replace(prepared.report, timings_s=timings_s)
+    def _plan(self, reading: SnrReading | None, request: InferRequest) -> Plan:
+        if reading is not None:
+            self.sending.hear(reading)
+        sizer, link = self._sizer, self._sizer.link
+
+        def tokens_in(bits: float, progressive: bool, least: int) -> int:
+            return sizer.tokens_in(
+                bits, request, progressive=progressive, least=least, window_s=link.window_s
+            )
+
+        return self.sending.plan(
+            Situation(
+                reading=reading,
+                link=link,
+                num_tokens=self.info.num_tokens,
+                most_tokens=sizer.most_tokens,
+                min_tokens=sizer.min_tokens,
+                tokens_in=tokens_in,
+                needs_snr=sizer.needs_snr,
+                sends_all=sizer.sends_all,
+            )
+        )
+
+    def _opened(self, reading: SnrReading | None, request: InferRequest, plan: Plan) -> StepReport:
+        report = StepReport(
+            session=self.session,
+            step=self._step,
+            policy=self.sending.name,
+            token_budget=plan.budget,
+            window_s=self._window_s(plan),
+        )
+        if reading is None:
+            return report
+        bits = self._sizer.link.window_bits(reading.snr_db)
+        return replace(
+            report,
+            snr_db=reading.snr_db,
+            snr_age_s=reading.age_s,
+            capacity_bits=bits,
+            paper_budget=self._sizer.paper_tokens(bits),
+            framed_budget=self._sizer.framed_tokens(
+                bits,
+                request,
+                progressive=plan.progressive,
+                least=plan.min_tokens,
+                window_s=report.window_s,
+            ),
+        )
+
+    def _window_s(self, plan: Plan) -> float:
+        link = self._sizer.link
+        return (plan.periods - 1) * link.period_s + link.window_s
+
+    def _stream(
+        self, request: InferRequest, payload: bytes, count: int, plan: Plan
+    ) -> PayloadStream:
+        window_s = self._window_s(plan)
+        bits = 8.0 * len(payload) if plan.cap_bits is None else plan.cap_bits
+        ends = self._sizer.piece_ends(count, bits, plan.min_tokens)
+        rate = None if plan.cap_bits is None else plan.cap_bits / 8.0 / window_s
+        return PayloadStream(request, payload, ends, window_s, plan.min_tokens, rate)
+
+    def _closed(self, prepared: Prepared, call_s: float, arrived: int = 0) -> StepReport:
+        """The report with its times and with what crossed; the policy learns from it."""
+        report, request, stream = prepared.report, prepared.request, prepared.stream
+        timings_s = report.timings_s | {
+            "call": call_s,
+            "total": time.perf_counter() - prepared.started,
+        }
+        report = replace(report, timings_s=timings_s)
+        # Without a call nothing crossed the link.
+        if request is None or call_s == 0.0:
+            report = replace(report, positions=report.positions[:0])
+        else:
+            sent = len(report.positions) if stream is None else stream.taken_tokens
+            report = replace(
+                report,
+                tokens=sent,
+                positions=report.positions[:sent],
+                payload_bytes=self._payload_bytes(sent),
+                encoded_bytes=len(request.payload) if stream is None else stream.taken_bytes,
+                framed_bytes=codec.wire_bytes(request.ByteSize())
+                if stream is None
+                else stream.taken_wire_bytes,
+            )
+        self.sending.learn(
+            Outcome(
+                offered_tokens=report.tokens,
+                arrived_tokens=arrived,
+                arrived_bits=8.0 * self._payload_bytes(arrived),
+                answered=arrived > 0,
+                periods=prepared.plan.periods,
+            )
+        )
+        return report
+
+    def _payload_bytes(self, tokens: int) -> int:
+        return codec.payload_bytes(tokens, self.info.token_dim, self._quantization)
 
     def _read_snr(self, snr: float | SnrReading | None) -> SnrReading | None:
         if snr is not None:

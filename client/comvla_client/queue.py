@@ -67,16 +67,21 @@ class ActionQueue:
         self._started = self.execute
         self._pending = deque(self._chunk[: self.execute])
 
-    def fall_back(self) -> tuple[Actions, int, Source]:
+    def fall_back(self, *, hold: bool = False) -> tuple[Actions, int, Source]:
         """What to do without an answer.
+
+        Args:
+            hold: stand still, whatever the last chunk still has.
 
         Returns:
             (H, A) actions, how many leading rows come from the last chunk, and where they come from.
             It is taken as given that the robot executes ``execute`` rows before it asks again.
         """
+        if hold:
+            self._started = self.horizon
         rest = self._nothing_yet[None][:0] if self._chunk is None else self._chunk[self._started :]
         self._started += self.execute
-        actions = np.tile(self._hold_action(), (self.horizon, 1))
+        actions = np.tile(self.hold_action, (self.horizon, 1))
         planned = len(rest)
         if planned:
             actions[:planned] = rest
@@ -88,7 +93,9 @@ class ActionQueue:
         """The next (A,) row to execute, or None when it is time to ask."""
         return self._pending.popleft().copy() if self._pending else None
 
-    def _hold_action(self) -> Actions:
+    @property
+    def hold_action(self) -> Actions:
+        """The action (A,) to hold with now."""
         if self._fixed_hold is not None:
             return self._fixed_hold
         if self._chunk is None:

@@ -47,9 +47,14 @@ class StepReport:
         detail: the server's or the channel's own words about a fallback.
         snr_db: SNR that sized the payload, in dB; None where nobody gave one.
         snr_age_s: its age in seconds.
-        capacity_bits: C_link of Eq. (1) at that SNR; None without an SNR.
-        token_budget: K*, before it is clipped to the N tokens there are.
-        tokens: tokens sent.
+        capacity_bits: C_link of Eq. (1) at that SNR, over the period less the link's reserve; None
+            without an SNR.
+        policy: name of the policy of sending.
+        token_budget: what that policy allowed, before it is clipped to the N tokens there are.
+        paper_budget: K* of Eq. (4) at that SNR; None without an SNR.
+        framed_budget: the same by all bytes that cross the wire; None without an SNR.
+        window_s: seconds that the payload had to cross.
+        tokens: tokens handed to the network.
         tokens_used: tokens that the server received whole and used.
         positions: (K,) int32 positions sent, most important first.
         payload_bytes: the paper's accounting, K·D·B/8.
@@ -71,7 +76,11 @@ class StepReport:
     snr_db: float | None = None
     snr_age_s: float | None = None
     capacity_bits: float | None = None
+    policy: str = "paper"
     token_budget: int = 0
+    paper_budget: int | None = None
+    framed_budget: int | None = None
+    window_s: float = 0.0
     tokens: int = 0
     tokens_used: int = 0
     positions: npt.NDArray[np.int32] = field(default_factory=_no_positions)

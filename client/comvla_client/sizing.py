@@ -1,38 +1,20 @@
-"""How many tokens a step sends: the link's budget, clipped to what there is."""
+"""How many tokens so many bits carry, counted as a client's ``budget`` says."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from comvla import codec
-from comvla.errors import LinkError
 from comvla.model_info import ModelInfo
 from comvla.v1.policy_pb2 import InferRequest
-from comvla_client.budget import LinkProfile, framed_token_budget, token_budget
-from comvla_client.snr import SnrReading
+from comvla_client.budget import LinkProfile, largest_that
 
 Budget: TypeAlias = "Literal['paper', 'framed'] | int"
 """``"paper"``: Eq. (4). ``"framed"``: all bytes on the wire. A number: that many, whatever the SNR."""
 
 
-@dataclass(frozen=True)
-class Size:
-    """The size of one step's payload.
-
-    Attributes:
-        budget: K*, not clipped.
-        count: tokens to send; 0 means send nothing.
-        capacity_bits: C_link of Eq. (1); None where no SNR is known.
-    """
-
-    budget: int
-    count: int
-    capacity_bits: float | None
-
-
 class TokenSizer:
-    """Sizes payloads for one model over one link.
+    """Turns bits into tokens for one model over one link.
 
     Args:
         info: the model.
@@ -72,65 +54,84 @@ class TokenSizer:
                 f"expected min_tokens in 1 to {info.num_tokens} (tokens of {info.name}), got "
                 f"{min_tokens}"
             )
+        self.link = link
+        self.min_tokens = min_tokens
+        self.sends_all = sends_all
         self._info = info
-        self._link = link
         self._quantization = quantization
         self._budget = budget
-        self._sends_all = sends_all
-        self._min_tokens = min_tokens
 
     @property
     def needs_snr(self) -> bool:
-        """Whether a step cannot be sized without an SNR."""
-        return not (isinstance(self._budget, int) or self._sends_all)
+        """Whether nothing can be sized without an SNR."""
+        return not (isinstance(self._budget, int) or self.sends_all)
 
     @property
     def most_tokens(self) -> int:
         """The most tokens that any step may send."""
-        if isinstance(self._budget, int) and not self._sends_all:
+        if isinstance(self._budget, int) and not self.sends_all:
             return min(self._budget, self._info.num_tokens)
         return self._info.num_tokens
 
-    def size(self, reading: SnrReading | None, request: InferRequest) -> Size:
-        """How many tokens to send now.
+    def tokens_in(
+        self, bits: float, request: InferRequest, *, progressive: bool, least: int, window_s: float
+    ) -> int:
+        """The tokens that ``bits`` carry, as ``budget`` counts; not clipped to the N there are.
 
         Args:
-            reading: the link's SNR, None where nobody knows it.
-            request: the request without its payload; its other fields take their share of the link.
-
-        Raises:
-            LinkError: the budget depends on the SNR and there is none.
+            bits: capacity of the link.
+            request: the request without its payload; its other fields take their share.
+            progressive: whether the payload goes in pieces.
+            least: tokens of the first piece.
+            window_s: as the head of the stream says.
         """
-        if reading is None:
-            if self.needs_snr:
-                raise LinkError(
-                    f"budget={self._budget!r} sizes the payload by the SNR, and none is known: pass "
-                    "step(..., snr=dB), give the client an snr source, or fix it with budget=K"
-                )
-            return Size(self.most_tokens, self.most_tokens, None)
-        capacity_bits = self._link.capacity_bits(reading.snr_db)
-        budget = self._token_budget(reading, request)
-        count = self._info.num_tokens if self._sends_all else min(budget, self._info.num_tokens)
-        # At −inf dB there is no link at all, whatever a fixed budget or a selector says.
-        sendable = capacity_bits > 0.0 and count >= self._min_tokens
-        return Size(budget, count if sendable else 0, capacity_bits)
-
-    def _token_budget(self, reading: SnrReading, request: InferRequest) -> int:
         if isinstance(self._budget, int):
             return self._budget
-        info = self._info
+        paper = self.paper_tokens(bits)
         if self._budget == "paper":
-            bits_per_token = info.token_dim * codec.bits_per_value(self._quantization)
-            return token_budget(reading.snr_db, self._link, bits_per_token)
-        return framed_token_budget(
-            reading.snr_db,
-            self._link,
-            token_dim=info.token_dim,
-            quantization=self._quantization,
-            num_towers=len(info.tower_dims),
-            session_id=request.session_id,
-            step=request.step,
-            instruction=request.instruction,
-            proprio_dim=info.proprio_dim,
-            model_fingerprint=request.model_fingerprint,
+            return paper
+        return self.framed_tokens(
+            bits, request, progressive=progressive, least=least, window_s=window_s
+        )
+
+    def paper_tokens(self, bits: float) -> int:
+        """Eq. (4): D · B bits for each token."""
+        return int(bits // (self._info.token_dim * codec.bits_per_value(self._quantization)))
+
+    def framed_tokens(
+        self, bits: float, request: InferRequest, *, progressive: bool, least: int, window_s: float
+    ) -> int:
+        """Tokens whose bytes all fit: positions, scales, protobuf, gRPC and HTTP/2 included."""
+        room_bytes = bits / 8.0
+        room_bytes -= codec.CALL_HEADERS_BYTES
+        envelope = request.ByteSize()
+        head = codec.progressive_head_bytes(envelope, window_s=window_s, min_tokens=least)
+
+        def fits(k: int) -> bool:
+            if progressive:
+                ends = self.piece_ends(k, bits, least)
+                return codec.progressive_wire_bytes(head, ends)[-1] <= room_bytes
+            payload = self._encoded_bytes(k)
+            # The payload is the one field that is not there yet.
+            field = codec.infer_request_bytes(payload, snr=False, snr_age=False, protocol_version=0)
+            return codec.wire_bytes(envelope + field) <= room_bytes
+
+        return largest_that(fits, self.paper_tokens(bits))
+
+    def piece_ends(self, k: int, bits: float, least: int) -> list[int]:
+        """Where a payload of ``k`` tokens is cut for a link that carries about ``bits``."""
+        dim, towers = self._info.token_dim, len(self._info.tower_dims)
+        piece = codec.tokens_per_piece(bits / 8.0, dim, self._quantization, num_towers=towers)
+        return codec.piece_ends(
+            k,
+            dim,
+            self._quantization,
+            num_towers=towers,
+            first_tokens=least,
+            piece_tokens=piece,
+        )
+
+    def _encoded_bytes(self, k: int) -> int:
+        return codec.encoded_bytes(
+            k, self._info.token_dim, self._quantization, num_towers=len(self._info.tower_dims)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import grpc
@@ -12,8 +13,11 @@ from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
 from comvla_client import channel
 from comvla_client.errors import ClientClosedError, TransportError
+from comvla_client.streaming import PayloadStream, paced
 
-__all__ = ["GrpcTransport", "Transport", "TransportError"]
+__all__ = ["GrpcTransport", "ProgressiveTransport", "Transport", "TransportError"]
+
+Start = Callable[[Any, float], Any]
 
 
 class Transport(Protocol):
@@ -37,6 +41,18 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Ends calls under way and frees the connection. May be called from another thread."""
+        ...
+
+
+class ProgressiveTransport(Transport, Protocol):
+    """A transport that also takes payloads in pieces, for policies that send so."""
+
+    def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
+        """Actions for as much of one observation as arrives within the stream's window.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+        """
         ...
 
 
@@ -68,7 +84,7 @@ class GrpcTransport:
             ClientClosedError: the transport is closed.
         """
         request = GetModelRequest(protocol_version=PROTOCOL_VERSION)
-        answer: GetModelResponse = self._call("GetModel", request, timeout_s)
+        answer: GetModelResponse = self._call(_unary("GetModel", request), timeout_s)
         return answer
 
     def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
@@ -78,7 +94,33 @@ class GrpcTransport:
             TransportError: no usable answer within ``timeout_s`` seconds.
             ClientClosedError: the transport is closed, before or during the call.
         """
-        answer: InferResponse = self._call("Infer", request, timeout_s)
+        answer: InferResponse = self._call(_unary("Infer", request), timeout_s)
+        return answer
+
+    def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
+        """Actions for as much of one observation as arrives within the stream's window.
+
+        gRPC takes one piece at a time and only when the one before was written. When the window
+        ends no further piece is handed out, when the time is over the call is cancelled, and what
+        gRPC still held is dropped.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+            ClientClosedError: the transport is closed, before or during the call.
+        """
+        stopped = threading.Event()
+
+        def start(stub: Any, remaining_s: float) -> Any:
+            nonlocal stopped
+            stopped.set()
+            stopped = threading.Event()
+            messages = paced(stream, min(stream.window_s, remaining_s), stopped)
+            return stub.InferProgressive.future(messages, timeout=remaining_s)
+
+        try:
+            answer: InferResponse = self._call(start, timeout_s).response
+        finally:
+            stopped.set()  # the thread that feeds gRPC may be waiting for its next piece
         return answer
 
     def close(self) -> None:
@@ -87,13 +129,13 @@ class GrpcTransport:
         with self._lock:
             self._channel.close()
 
-    def _call(self, method: str, request: Any, timeout_s: float) -> Any:
+    def _call(self, start: Start, timeout_s: float) -> Any:
         attempts = channel.Attempts(timeout_s)
         if self._unanswered >= channel.FRESH_CHANNEL_AFTER:
             self._renew()
         while True:
             try:
-                answer = self._attempt(method, request, attempts.remaining_s())
+                answer = self._attempt(start, attempts.remaining_s())
             except TransportError as error:
                 if self._closed.wait(attempts.pause_s(error)):
                     raise self._closed_error() from error
@@ -102,14 +144,14 @@ class GrpcTransport:
                 self._unanswered = 0
                 return answer
 
-    def _attempt(self, method: str, request: Any, timeout_s: float) -> Any:
+    def _attempt(self, start: Start, timeout_s: float) -> Any:
         if self._closed.is_set():
             raise self._closed_error()
         call = None
         try:
             with self._lock:
                 stub = policy_pb2_grpc.PolicyServiceStub(self._channel)
-            call = getattr(stub, method).future(request, timeout=timeout_s)
+            call = start(stub, timeout_s)
             # gRPC's own timer may fire late; this wait does not.
             return call.result(timeout=timeout_s)
         except grpc.FutureTimeoutError:
@@ -122,7 +164,7 @@ class GrpcTransport:
             if self._closed.is_set() or not isinstance(error, grpc.RpcError):
                 raise self._closed_error() from error
             failure = channel.transport_error(error)
-            self._unanswered += failure.code == "DEADLINE_EXCEEDED"
+            self._unanswered += channel.is_silence(failure)
             raise failure from error
 
     def _renew(self) -> None:
@@ -138,3 +180,7 @@ class GrpcTransport:
 
     def _closed_error(self) -> ClientClosedError:
         return ClientClosedError(f"the connection to {self.target} was closed: make a new client")
+
+
+def _unary(method: str, request: Any) -> Start:
+    return lambda stub, timeout_s: getattr(stub, method).future(request, timeout=timeout_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import grpc
@@ -13,6 +14,9 @@ from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
 from comvla_client import channel
 from comvla_client.errors import ClientClosedError, TransportError
+from comvla_client.streaming import PayloadStream, paced_async
+
+Start = Callable[[Any, float], Any]
 
 
 class AsyncTransport(Protocol):
@@ -28,6 +32,14 @@ class AsyncTransport(Protocol):
 
     async def close(self) -> None:
         """Ends calls under way and frees the connection."""
+        ...
+
+
+class AsyncProgressiveTransport(AsyncTransport, Protocol):
+    """:class:`comvla_client.transport.ProgressiveTransport` with awaitable calls."""
+
+    async def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
+        """Actions for as much of one observation as arrives in time, or TransportError."""
         ...
 
 
@@ -55,7 +67,7 @@ class GrpcAioTransport:
             ClientClosedError: the transport is closed.
         """
         request = GetModelRequest(protocol_version=PROTOCOL_VERSION)
-        answer: GetModelResponse = await self._call("GetModel", request, timeout_s)
+        answer: GetModelResponse = await self._call(_unary("GetModel", request), timeout_s)
         return answer
 
     async def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
@@ -65,7 +77,22 @@ class GrpcAioTransport:
             TransportError: no usable answer within ``timeout_s`` seconds.
             ClientClosedError: the transport is closed, before or during the call.
         """
-        answer: InferResponse = await self._call("Infer", request, timeout_s)
+        answer: InferResponse = await self._call(_unary("Infer", request), timeout_s)
+        return answer
+
+    async def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
+        """Actions for as much of one observation as arrives within the stream's window.
+
+        Raises:
+            TransportError: no usable answer within ``timeout_s`` seconds.
+            ClientClosedError: the transport is closed, before or during the call.
+        """
+
+        def start(stub: Any, remaining_s: float) -> Any:
+            messages = paced_async(stream, min(stream.window_s, remaining_s))
+            return stub.InferProgressive(messages, timeout=remaining_s)
+
+        answer: InferResponse = (await self._call(start, timeout_s)).response
         return answer
 
     async def close(self) -> None:
@@ -73,13 +100,13 @@ class GrpcAioTransport:
         self._closed.set()
         await self._drop_channel()
 
-    async def _call(self, method: str, request: Any, timeout_s: float) -> Any:
+    async def _call(self, start: Start, timeout_s: float) -> Any:
         attempts = channel.Attempts(timeout_s)
         if self._unanswered >= channel.FRESH_CHANNEL_AFTER:
             await self._drop_channel()
         while True:
             try:
-                answer = await self._attempt(method, request, attempts.remaining_s())
+                answer = await self._attempt(start, attempts.remaining_s())
             except TransportError as error:
                 await asyncio.sleep(attempts.pause_s(error))
                 await self._drop_channel()
@@ -87,16 +114,16 @@ class GrpcAioTransport:
                 self._unanswered = 0
                 return answer
 
-    async def _attempt(self, method: str, request: Any, timeout_s: float) -> Any:
+    async def _attempt(self, start: Start, timeout_s: float) -> Any:
         if self._closed.is_set():
             raise self._closed_error()
         if self._channel is None:
             # Made here and not before, because a channel belongs to the loop that runs.
             self._channel = grpc.aio.insecure_channel(self.target, options=channel.CHANNEL_OPTIONS)
-        call = getattr(policy_pb2_grpc.PolicyServiceStub(self._channel), method)
+        stub = policy_pb2_grpc.PolicyServiceStub(self._channel)
         try:
             # gRPC's own timer may fire late; this wait does not.
-            return await asyncio.wait_for(call(request, timeout=timeout_s), timeout_s)
+            return await asyncio.wait_for(start(stub, timeout_s), timeout_s)
         except asyncio.TimeoutError:
             self._unanswered += 1
             raise channel.unanswered(timeout_s) from None
@@ -104,7 +131,7 @@ class GrpcAioTransport:
             if self._closed.is_set() or not isinstance(error, grpc.RpcError):
                 raise self._closed_error() from error
             failure = channel.transport_error(error)
-            self._unanswered += failure.code == "DEADLINE_EXCEEDED"
+            self._unanswered += channel.is_silence(failure)
             raise failure from error
         except asyncio.CancelledError as error:
             # Closing the channel cancels its calls; a cancelled task is another matter.
@@ -119,3 +146,7 @@ class GrpcAioTransport:
 
     def _closed_error(self) -> ClientClosedError:
         return ClientClosedError(f"the connection to {self.target} was closed: make a new client")
+
+
+def _unary(method: str, request: Any) -> Start:
+    return lambda stub, timeout_s: getattr(stub, method)(request, timeout=timeout_s)

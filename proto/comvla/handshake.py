@@ -41,6 +41,7 @@ def to_response(
     quantizations: Sequence[str],
     max_request_bytes: int,
     server_version: str,
+    progressive: bool = False,
 ) -> policy_pb2.GetModelResponse:
     """The server's answer to ``GetModel``.
 
@@ -49,6 +50,7 @@ def to_response(
         quantizations: names of :data:`comvla.codec.QUANTIZATIONS` that it reads.
         max_request_bytes: largest ``InferRequest`` that it reads.
         server_version: release, for people.
+        progressive: whether it answers ``InferProgressive``.
 
     Raises:
         ValueError: a quantization that the protocol does not know.
@@ -71,6 +73,7 @@ def to_response(
         max_request_bytes=max_request_bytes,
         server_version=server_version,
         image_size=info.image_size,
+        progressive=progressive,
     )
 
 

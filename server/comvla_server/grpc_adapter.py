@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,12 +20,12 @@ SERVICE_NAME = policy_pb2.DESCRIPTOR.services_by_name["PolicyService"].full_name
 
 # The service refuses messages above max_request_bytes with words; gRPC itself refuses, before it
 # allocates, those that are larger still.
-_HARD_CAP_FACTOR = 2
+_WORDS_UP_TO = 1.125
 
 
 @dataclass(frozen=True)
 class _Malformed:
-    """Bytes that are no InferRequest."""
+    """Bytes that are no message of the contract."""
 
     size_bytes: int
 
@@ -47,7 +48,7 @@ def server_options(settings: ServerSettings) -> list[tuple[str, int]]:
         *codec.GRPC_OPTIONS,
         # Two servers on one port would silently share its robots.
         ("grpc.so_reuseport", 0),
-        ("grpc.max_receive_message_length", _HARD_CAP_FACTOR * settings.max_request_bytes),
+        ("grpc.max_receive_message_length", int(_WORDS_UP_TO * settings.max_request_bytes)),
         ("grpc.keepalive_permit_without_calls", 1),
         ("grpc.http2.min_ping_interval_without_data_ms", min_ping_ms),
         # The server's own pings find robots that vanished without a word, idle ones too.
@@ -72,6 +73,11 @@ def add_policy_service(server: grpc.aio.Server, service: PolicyService) -> None:
             await context.abort(STATUS[refusal.reason], refusal.message)
         return await service.Infer(request, context)
 
+    async def infer_progressive(
+        messages: AsyncIterator[Any], context: grpc.aio.ServicerContext[Any, Any]
+    ) -> policy_pb2.InferProgressiveResponse:
+        return await service.InferProgressive(messages, context)
+
     async def get_model(
         request: policy_pb2.GetModelRequest | _Malformed,
         context: grpc.aio.ServicerContext[Any, Any],
@@ -86,6 +92,11 @@ def add_policy_service(server: grpc.aio.Server, service: PolicyService) -> None:
             infer,
             request_deserializer=_parser(policy_pb2.InferRequest),
             response_serializer=policy_pb2.InferResponse.SerializeToString,
+        ),
+        "InferProgressive": grpc.stream_unary_rpc_method_handler(
+            infer_progressive,
+            request_deserializer=_parser(policy_pb2.InferProgressiveRequest),
+            response_serializer=policy_pb2.InferProgressiveResponse.SerializeToString,
         ),
         "GetModel": grpc.unary_unary_rpc_method_handler(
             get_model,

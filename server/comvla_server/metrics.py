@@ -8,6 +8,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.process_collector import ProcessCollector
 
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
+from comvla_server.piecewise import ENDINGS
 from comvla_server.refusals import Reason
 
 # 1 to 500 ms: a control period is tens of milliseconds, anything above is a miss.
@@ -66,28 +67,42 @@ class Metrics:
         )
         self.step_phase = Histogram(
             "comvla_step_phase_seconds",
-            "Time of one phase of an answered step: decode, queue, predict.",
+            "Time of one phase of an answered step: collect (pieces only), decode, queue, predict.",
             ["phase"],
             buckets=SECONDS_BUCKETS,
             registry=self.registry,
         )
         self.requests_dropped = Counter(
             "comvla_requests_dropped",
-            "Infer calls that ended without actions, by reason.",
+            "Infer and InferProgressive calls that ended without actions, by reason.",
             ["reason"],
+            registry=self.registry,
+        )
+        self.streams = Counter(
+            "comvla_progressive_streams",
+            "Payloads that came in pieces, by how the stream ended: whole, closed by the robot, "
+            "window over, repeat of a recorded step, or refused.",
+            ["ending"],
             registry=self.registry,
         )
         # Every series exists from the start: a rate over a late one loses its first step.
         for reason in Reason:
             self.requests_dropped.labels(reason.value)
-        for phase in ("decode", "queue", "predict"):
+        for phase in ("collect", "decode", "queue", "predict"):
             self.step_phase.labels(phase)
+        for ending in ENDINGS:
+            self.streams.labels(ending)
         self._queue_depth = Gauge(
             "comvla_queue_depth", "Requests that wait for the model.", registry=self.registry
         )
         self._utilization = Gauge(
             "comvla_inference_utilization_ratio",
             "Busy share of the inference thread over the last seconds.",
+            registry=self.registry,
+        )
+        self._in_flight = Gauge(
+            "comvla_bytes_in_flight",
+            "Bytes that open calls hold, as messages and as decoded tokens.",
             registry=self.registry,
         )
         self._sessions = Gauge(
@@ -114,6 +129,10 @@ class Metrics:
         self._queue_depth.set_function(queue_depth)
         self._utilization.set_function(utilization)
         self._sessions.set_function(sessions)
+
+    def watch_bytes(self, in_flight: Callable[[], float]) -> None:
+        """Reads the bytes in flight at every scrape."""
+        self._in_flight.set_function(in_flight)
 
     def watch_ready(self, ready: Callable[[], bool]) -> None:
         """Reads readiness at every scrape."""

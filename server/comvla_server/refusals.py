@@ -16,7 +16,8 @@ class Reason(str, Enum):
     CONFLICT = "conflict"  # a step that was already sent with other content
     MISMATCH = "mismatch"  # another model or another protocol
     OVERSIZE = "oversize"  # message larger than the cap
-    OVERLOAD = "overload"  # queue full
+    OVERLOAD = "overload"  # queue full, or too many bytes in flight
+    SHORT = "short"  # too few tokens of a payload in pieces arrived within its window
     SUPERSEDED = "superseded"  # a newer observation of the session came
     DEADLINE = "deadline"  # too late to be of use
     CANCELLED = "cancelled"  # the robot hung up

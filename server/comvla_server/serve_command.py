@@ -107,6 +107,7 @@ def add_parser(subparsers: Any) -> None:
         ("max_queue", int, "most robots that may wait; one more is answered RESOURCE_EXHAUSTED"),
         ("max_sessions", int, "most sessions whose last answer is kept for a retry"),
         ("max_request_bytes", int, "largest request, bytes"),
+        ("max_bytes_in_flight", int, "most bytes that all open calls hold together"),
         ("default_deadline_s", float, "deadline of calls that bring none, seconds"),
         ("grace_s", float, "time that calls in flight get when the server stops, seconds"),
     ):
@@ -141,6 +142,7 @@ def run(args: argparse.Namespace) -> int:
         max_queue=args.max_queue,
         max_sessions=args.max_sessions,
         max_request_bytes=args.max_request_bytes,
+        max_bytes_in_flight=args.max_bytes_in_flight,
         default_deadline_s=args.default_deadline_s,
         grace_s=args.grace_s,
     )

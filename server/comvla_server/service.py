@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,22 +13,18 @@ import grpc
 from comvla import codec, handshake
 from comvla.errors import CodecError
 from comvla.v1 import policy_pb2, policy_pb2_grpc
+from comvla_server.accounts import Answered, CallAccounts
 from comvla_server.batcher import Batcher
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle
-from comvla_server.log_throttle import LogThrottle
+from comvla_server.memory import BytesInFlight, Lease
 from comvla_server.metrics import Metrics
+from comvla_server.piecewise import PieceReader
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.settings import ServerSettings
 from comvla_server.tickets import Answer
 from comvla_server.validation import Validator, content_digest
 from comvla_server.version import server_version
-from comvla_server.wording import shown
-
-_log = logging.getLogger(__name__)
-
-# A robot's own deadline began when it sent: it hangs up earlier than the deadline seen from here.
-_TRANSIT_S = 0.05
 
 STATUS = {
     Reason.MALFORMED: grpc.StatusCode.INVALID_ARGUMENT,
@@ -38,6 +33,7 @@ STATUS = {
     Reason.MISMATCH: grpc.StatusCode.FAILED_PRECONDITION,
     Reason.OVERSIZE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.OVERLOAD: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Reason.SHORT: grpc.StatusCode.DEADLINE_EXCEEDED,
     Reason.SUPERSEDED: grpc.StatusCode.ABORTED,
     Reason.DEADLINE: grpc.StatusCode.DEADLINE_EXCEEDED,
     Reason.CANCELLED: grpc.StatusCode.CANCELLED,
@@ -67,7 +63,6 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
     Attributes:
         runtime: the loaded model behind its queue, None while loading.
-        idle: set while no Infer call is open.
     """
 
     def __init__(
@@ -78,14 +73,18 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.runtime: Runtime | None = None
-        self.idle = asyncio.Event()
-        self.idle.set()
-        self._calls = 0
         self._lifecycle = lifecycle
         self._metrics = metrics
         self._settings = settings
         self._clock = clock
-        self._throttle = LogThrottle(clock)
+        self._accounts = CallAccounts(metrics, settings.default_deadline_s, clock)
+        self._in_flight = BytesInFlight(settings.max_bytes_in_flight)
+        metrics.watch_bytes(lambda: self._in_flight.held)
+
+    @property
+    def idle(self) -> asyncio.Event:
+        """Set while no call for actions is open."""
+        return self._accounts.idle
 
     async def GetModel(
         self, request: policy_pb2.GetModelRequest, context: grpc.aio.ServicerContext[Any, Any]
@@ -100,6 +99,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             quantizations=codec.QUANTIZATIONS,
             max_request_bytes=self._settings.max_request_bytes,
             server_version=server_version(),
+            progressive=True,
         )
 
     async def Infer(
@@ -110,6 +110,16 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             return await self.infer(request, context.time_remaining())
         except Refusal as refusal:
             await context.abort(STATUS[refusal.reason], refusal.message)
+
+    async def InferProgressive(
+        self, messages: AsyncIterator[Any], context: grpc.aio.ServicerContext[Any, Any]
+    ) -> policy_pb2.InferProgressiveResponse:
+        """Actions for as much of one observation as came in time, or a status that says why not."""
+        try:
+            response = await self.infer_progressive(messages, context.time_remaining())
+        except Refusal as refusal:
+            await context.abort(STATUS[refusal.reason], refusal.message)
+        return policy_pb2.InferProgressiveResponse(response=response)
 
     async def infer(
         self, request: policy_pb2.InferRequest, time_remaining_s: float | None
@@ -123,41 +133,38 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         Raises:
             Refusal: no actions, and why.
         """
-        started_s = self._clock()
-        deadline_s = started_s + (
-            self._settings.default_deadline_s if time_remaining_s is None else time_remaining_s
-        )
-        outcome = Reason.CANCELLED.value
-        self._calls += 1
-        self.idle.clear()
-        try:
-            self._count_arrival(request)
-            response, repeat = await self._answer(request, started_s, deadline_s)
-            outcome = "repeat" if repeat else "ok"
-            return response
-        except Refusal as refusal:
-            outcome = refusal.reason.value
-            self._note_refusal(request, refusal)
-            raise
-        except asyncio.CancelledError:
-            if self._clock() >= deadline_s - _TRANSIT_S:
-                outcome = Reason.DEADLINE.value
-            self._metrics.requests_dropped.labels(outcome).inc()
-            raise
-        except Exception as error:
-            outcome = Reason.MODEL.value
-            _log.exception("a request broke the server's own code")
-            self._metrics.requests_dropped.labels(outcome).inc()
-            raise Refusal(
-                Reason.MODEL,
-                f"expected actions, the server failed with {type(error).__name__}: "
-                "its log says more, please report it",
-            ) from error
-        finally:
-            self._calls -= 1
-            if not self._calls:
-                self.idle.set()
-            self._metrics.step_duration.labels(outcome).observe(self._clock() - started_s)
+
+        async def work(started_s: float, deadline_s: float) -> Answered:
+            self._count_message(request.ByteSize())
+            self._count_payload(request.payload)
+            with self._in_flight.lease() as lease:
+                lease.take(request.ByteSize())
+                return await self._answer(request, lease, started_s, deadline_s)
+
+        return await self._accounts.run(request, time_remaining_s, work)
+
+    async def infer_progressive(
+        self, messages: AsyncIterator[Any], time_remaining_s: float | None
+    ) -> policy_pb2.InferResponse:
+        """:meth:`InferProgressive` without a transport.
+
+        A repeat is known by its head, whatever prefix of its payload came the first time: it is
+        answered from the record, and its pieces are not waited for.
+
+        Args:
+            messages: parsed messages in order.
+            time_remaining_s: seconds until the caller gives up, None where it did not say.
+
+        Raises:
+            Refusal: no actions, and why.
+        """
+        request = policy_pb2.InferRequest()  # becomes the one that Infer would have got
+
+        async def work(started_s: float, deadline_s: float) -> Answered:
+            with self._in_flight.lease() as lease:
+                return await self._answer_stream(request, messages, lease, started_s, deadline_s)
+
+        return await self._accounts.run(request, time_remaining_s, work)
 
     def note_malformed(self, size_bytes: int) -> Refusal:
         """Counts bytes that are no InferRequest, and says so."""
@@ -166,8 +173,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             f"expected a comvla.v1.InferRequest, got {size_bytes} bytes that do not parse as one: "
             "build requests from the contract's generated code",
         )
-        self._metrics.tx_framed_bytes.inc(codec.wire_bytes(size_bytes))
-        self._note_refusal(policy_pb2.InferRequest(), refusal)
+        self._count_message(size_bytes)
+        self._accounts.note_refusal(policy_pb2.InferRequest(), refusal)
         return refusal
 
     def _require_runtime(self) -> Runtime:
@@ -175,9 +182,48 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         assert self.runtime is not None, "a server that is ready has a model"
         return self.runtime
 
+    async def _answer_stream(
+        self,
+        request: policy_pb2.InferRequest,
+        messages: AsyncIterator[Any],
+        lease: Lease,
+        started_s: float,
+        deadline_s: float,
+    ) -> Answered:
+        runtime = self._require_runtime()
+
+        def note(message: policy_pb2.InferProgressiveRequest) -> None:
+            size = message.ByteSize()
+            self._count_message(size)
+            lease.take(size)
+
+        reader = PieceReader(messages, runtime.engine.info, note, self._clock)
+        try:
+            patience_s = min(deadline_s - started_s, self._settings.default_deadline_s)
+            head = await reader.head(patience_s)
+            request.CopyFrom(head.request)
+            runtime.validator.check_head(request)
+            digest = content_digest(request)
+            if runtime.batcher.find(request.session_id, request.step, digest) is not None:
+                reader.ending = "repeat"
+            else:
+                headed_s = self._clock()
+                window_s = min(head.window_s, deadline_s - headed_s)
+                request.payload = await reader.collect(window_s, head.min_tokens)
+                self._metrics.step_phase.labels("collect").observe(self._clock() - headed_s)
+        finally:
+            self._count_payload(reader.payload)
+            self._metrics.streams.labels(reader.ending).inc()
+        return await self._answer(request, lease, started_s, deadline_s, digest)
+
     async def _answer(
-        self, request: policy_pb2.InferRequest, started_s: float, deadline_s: float
-    ) -> tuple[policy_pb2.InferResponse, bool]:
+        self,
+        request: policy_pb2.InferRequest,
+        lease: Lease,
+        started_s: float,
+        deadline_s: float,
+        digest: bytes | None = None,
+    ) -> Answered:
         runtime = self._require_runtime()
         if deadline_s <= started_s:
             raise Refusal(
@@ -186,15 +232,18 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 "was left; allow more time or send fewer tokens",
             )
         runtime.validator.check_identity(request)
-        digest = content_digest(request)
+        if digest is None:
+            digest = content_digest(request)
         batcher = runtime.batcher
         ticket = batcher.find(request.session_id, request.step, digest)
         repeat = ticket is not None
         on_record = ticket is not None and ticket.outcome.done()
         decode_s = 0.0
         if ticket is None:
+            decode_began_s = self._clock()
+            lease.take(_decoded_bytes(request.payload))
             policy_request = runtime.validator.read(request)
-            decode_s = self._clock() - started_s
+            decode_s = self._clock() - decode_began_s
             self._metrics.step_phase.labels("decode").observe(decode_s)
             ticket = batcher.admit(request.session_id, request.step, policy_request, digest)
         answer = await batcher.wait(ticket, deadline_s)
@@ -225,36 +274,35 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             model_fingerprint=runtime.engine.info.fingerprint,
         )
 
-    def _count_arrival(self, request: policy_pb2.InferRequest) -> None:
+    def _count_message(self, size_bytes: int) -> None:
         """What crossed the link, whatever becomes of it."""
-        metrics, payload = self._metrics, request.payload
-        metrics.tx_framed_bytes.inc(codec.wire_bytes(request.ByteSize()))
+        self._metrics.tx_framed_bytes.inc(codec.wire_bytes(size_bytes))
+
+    def _count_payload(self, payload: bytes | bytearray) -> None:
+        metrics = self._metrics
         metrics.tx_encoded_bytes.inc(len(payload))
         try:
             header = codec.read_header(payload)
         except CodecError:
             return
-        dim, quantization = header.token_dim, header.quantization
-        arrived = codec.prefix_tokens(
-            len(payload), dim, quantization, num_towers=len(header.tower_dims)
-        )
-        tokens = min(arrived, header.count)
+        tokens = _whole_tokens(header, len(payload))
         metrics.tokens_received.inc(tokens)
         metrics.request_tokens.observe(tokens)
-        metrics.tx_payload_bytes.inc(codec.payload_bytes(tokens, dim, quantization))
+        paper_bytes = codec.payload_bytes(tokens, header.token_dim, header.quantization)
+        metrics.tx_payload_bytes.inc(paper_bytes)
 
-    def _note_refusal(self, request: policy_pb2.InferRequest, refusal: Refusal) -> None:
-        self._metrics.requests_dropped.labels(refusal.reason.value).inc()
-        suppressed = self._throttle.allow(refusal.reason.value)
-        if suppressed is None:
-            return
-        _log.info(
-            "refused: %s",
-            refusal.message,
-            extra={
-                "reason": refusal.reason.value,
-                "session": shown(request.session_id),
-                "step": request.step,
-                "suppressed": suppressed,
-            },
-        )
+
+def _whole_tokens(header: codec.PayloadHeader, length: int) -> int:
+    arrived = codec.prefix_tokens(
+        length, header.token_dim, header.quantization, num_towers=len(header.tower_dims)
+    )
+    return min(arrived, header.count)
+
+
+def _decoded_bytes(payload: bytes) -> int:
+    """What the tokens of a payload take as float32; 0 where it is none."""
+    try:
+        header = codec.read_header(payload)
+    except CodecError:
+        return 0
+    return 4 * _whole_tokens(header, len(payload)) * header.token_dim

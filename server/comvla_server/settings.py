@@ -27,6 +27,8 @@ class ServerSettings:
         default_deadline_s: deadline of a call that brought none, seconds.
         max_request_bytes: largest InferRequest that is read, bytes. The default holds 512 float32
             tokens of width 2176 (4.5 MB).
+        max_bytes_in_flight: most bytes that all open calls may hold together, as messages and as
+            decoded tokens; one more is answered RESOURCE_EXHAUSTED.
         max_concurrent_calls: most calls open at once, health watchers included.
         grace_s: seconds that calls in flight may still take when the server stops.
         min_ping_interval_s: a client whose keepalive pings come faster than this loses its
@@ -42,6 +44,7 @@ class ServerSettings:
     session_ttl_s: float = 600.0
     default_deadline_s: float = 5.0
     max_request_bytes: int = 8 * 2**20
+    max_bytes_in_flight: int = 512 * 2**20
     max_concurrent_calls: int = 1024
     grace_s: float = 10.0
     min_ping_interval_s: float = 5.0
@@ -67,6 +70,8 @@ class ServerSettings:
         least = self.max_queue + self.max_batch
         self._whole("max_sessions", least, 10_000_000, "it covers max_queue + max_batch")
         self._whole("max_request_bytes", 1024, 2**30, "8388608 holds 512 float32 tokens of 2176")
+        least = 2 * self.max_request_bytes
+        self._whole("max_bytes_in_flight", least, 2**40, "it holds one request and its tokens")
         self._whole("max_concurrent_calls", 1, 1_000_000, "1024 suits most")
         for name in ("session_ttl_s", "default_deadline_s", "min_ping_interval_s"):
             self._seconds(name, zero=False)

@@ -77,6 +77,17 @@ class Validator:
             )
         self._check_lengths(request)
 
+    def check_head(self, request: policy_pb2.InferRequest) -> None:
+        """All that can be told before the first token, so that no robot sends tokens for nothing.
+
+        Raises:
+            Refusal: oversize, mismatch or invalid.
+        """
+        self.check_identity(request)
+        self._check_link_report(request)
+        self._check_instruction(request.instruction)
+        self._proprio(request)
+
     def read(self, request: policy_pb2.InferRequest) -> PolicyRequest:
         """Checks the content and decodes the tokens.
 

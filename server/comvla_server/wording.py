@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-# A gRPC status message travels in an HTTP/2 header block, of which peers accept 8 KiB.
+import itertools
+
+# A gRPC status message travels percent-encoded in an HTTP/2 header block, of which peers accept
+# 8 KiB. An emoji, say, is one character and twelve bytes there.
 MAX_MESSAGE_CHARS = 1000
+MAX_ENCODED_BYTES = 3000
 
 
 def shown(text: str, limit: int = 64) -> str:
@@ -16,7 +20,27 @@ def shown(text: str, limit: int = 64) -> str:
     return f"{text[:limit]!a}… ({len(text)} characters)"
 
 
-def one_line(message: str, limit: int = MAX_MESSAGE_CHARS) -> str:
-    """A message on one line, without control characters, cut to ``limit`` characters."""
+def one_line(
+    message: str, limit: int = MAX_MESSAGE_CHARS, encoded_limit: int = MAX_ENCODED_BYTES
+) -> str:
+    """A message on one line, without control characters, cut where it gets too long.
+
+    Args:
+        message: any text.
+        limit: most characters.
+        encoded_limit: most bytes once gRPC has percent-encoded it.
+    """
     flat = "".join(c if c.isprintable() else " " for c in message[: 4 * limit])
-    return flat if len(flat) <= limit else flat[: limit - 1] + "…"
+    if len(flat) <= limit and sum(map(_encoded_bytes, flat)) <= encoded_limit:
+        return flat
+    room = encoded_limit - _encoded_bytes("…")
+    spent = itertools.accumulate(map(_encoded_bytes, flat[: limit - 1]))
+    kept = sum(1 for _ in itertools.takewhile(lambda size: size <= room, spent))
+    return flat[:kept] + "…"
+
+
+def _encoded_bytes(character: str) -> int:
+    """Bytes of a character in a ``grpc-message`` header: printable ASCII but % as it is."""
+    if " " <= character <= "~" and character != "%":
+        return 1
+    return 3 * len(character.encode("utf-8", "replace"))

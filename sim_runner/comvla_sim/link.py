@@ -8,78 +8,70 @@ may run slower or faster than the robot would and the link stays the same.
 from __future__ import annotations
 
 import bisect
-import itertools
-import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from comvla import codec
 from comvla.errors import LinkError
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
-from comvla_client import LinkProfile
+from comvla_client import LinkProfile, SnrReading
 from comvla_client.errors import TransportError
+from comvla_client.streaming import PayloadStream, periods_of
 from comvla_client.transport import Transport
+from comvla_sim.link_records import LinkRecord, PeriodRecord
+from comvla_sim.radio import Radio
 
-MODES = ("prefix", "drop")
+__all__ = ["COUNTS", "MODES", "EnforcedLink", "LinkRecord", "PeriodRecord"]
+
+MODES = ("prefix", "drop", "queue")
 COUNTS = ("framed", "encoded")
 
 
-@dataclass(frozen=True)
-class LinkRecord:
-    """What became of one request on the radio link.
-
-    Attributes:
-        period: control period in which it was sent, from 0.
-        snr_db: true SNR of that period, dB.
-        capacity_bits: C_link, what the link carries in the whole period (Eq. (1)).
-        available_bits: what earlier requests of the same period left of it.
-        offered_bytes: what the robot wanted to send.
-        delivered_bytes: what crossed; never more than ``available_bits / 8``.
-        offered_tokens: tokens that the robot wanted to send.
-        delivered_tokens: tokens that arrived whole, 0 where the request was lost.
-        airtime_s: share of the control period that the delivered bytes took, in seconds.
-    """
-
-    period: int
-    snr_db: float
-    capacity_bits: float
-    available_bits: float
-    offered_bytes: int
-    delivered_bytes: int
-    offered_tokens: int
-    delivered_tokens: int
-    airtime_s: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for ``json.dumps``; an SNR of −inf becomes the string "-inf"."""
-        plain = asdict(self)
-        if math.isinf(self.snr_db):
-            plain["snr_db"] = "-inf"
-        return plain
-
-
 class EnforcedLink:
-    """A transport whose uplink carries no more than the capacity of the current control period.
+    """A transport whose uplink carries no more than the capacity of each control period.
 
     A robot that sized its payload by the true SNR loses nothing. One that sent too much, because
-    its SNR was old or its accounting left something out, loses the excess: the bytes that arrive
-    are a prefix of the payload, which decodes to its most important tokens. The downlink is free.
+    its SNR was old or its accounting left something out, meets the mode. The downlink is free, and
+    an answer to what arrived before the link profile's reserve begins counts as there in the same
+    period.
+
+    An episode drives it so: one action is one period, and ``step`` may take periods of its own,
+    during which the robot holds. The link knows the true SNR; what the client is told may be old::
+
+        link = EnforcedLink(transport, channel, profile, mode="queue")
+        robot = ComVLAClient(link, edge=edge, link=profile, sending="margin", deadline_s=600.0)
+        while not done:
+            hold, asked = robot.hold_action, link.period
+            chunk = robot.step(observation, words, link.reading(delay_periods=d))
+            for _ in range(link.period - asked):     # the answer took so many periods
+                world.advance(hold)
+            for action in chunk.actions[: max(1, chunk.planned)]:
+                link.advance()
+                world.advance(action)
+
+    ``deadline_s`` is on the wall clock, where simulated time stands still while a machine computes:
+    make it large. Policies that look at times of readings take ``lambda: link.time_s`` as a clock.
 
     Args:
         transport: where requests go once they have crossed the radio.
         channel: SNR in dB of each control period (:mod:`comvla_sim.channel`).
-        link: bandwidth, period and efficiency of the radio.
-        mode: what happens to a payload that does not fit: ``"prefix"`` cuts it after the last byte
-            that does, ``"drop"`` loses it whole.
+        link: bandwidth, period, efficiency and reserve of the radio.
+        mode: what happens to a payload that does not fit into its period. ``"prefix"`` cuts it
+            after the last byte that does, and what arrived is used; ``"drop"`` loses it whole;
+            ``"queue"`` goes on in the next periods while the robot waits, and the answer comes
+            late. A payload in pieces is cut in every mode when its window ends.
         count: what takes up capacity: ``"framed"`` is every byte of the call on the wire (protobuf,
             gRPC, HTTP/2 frames and headers); ``"encoded"`` the coded payload alone.
+        patience_periods: with ``"queue"``, periods that the robot waits for an answer, the one in
+            which it asks included.
+        buffer_bytes: with ``"queue"``, what the robot's network stack holds of a call that was
+            given up. It cannot be taken back and crosses before anything newer.
 
     Attributes:
         log: one record for each request, in order.
 
     Raises:
-        LinkError: an unknown mode or count, or a channel that ends.
+        LinkError: an unknown mode or count, a number out of range, or a channel that ends.
     """
 
     def __init__(
@@ -88,129 +80,220 @@ class EnforcedLink:
         channel: Iterable[float],
         link: LinkProfile,
         *,
-        mode: Literal["prefix", "drop"] = "prefix",
+        mode: Literal["prefix", "drop", "queue"] = "prefix",
         count: Literal["framed", "encoded"] = "framed",
+        patience_periods: int = 8,
+        buffer_bytes: int = 16_384,
     ) -> None:
         if mode not in MODES:
             raise LinkError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
         if count not in COUNTS:
             raise LinkError(f"count must be one of {', '.join(COUNTS)}, got {count!r}")
+        if patience_periods < 1 or buffer_bytes < 0:
+            raise LinkError(
+                "expected patience_periods of at least 1 and buffer_bytes of at least 0, got "
+                f"{patience_periods} and {buffer_bytes}"
+            )
         self._transport = transport
-        self._values = iter(channel)
         self._link = link
         self._mode = mode
         self._count = count
-        self._period = -1
+        self._patience_periods = patience_periods
+        # Unless it queues, a modem forgets what did not cross when it should have.
+        self._radio = Radio(channel, link, buffer_bytes if mode == "queue" else 0)
         self.log: list[LinkRecord] = []
-        self.advance()
+
+    @property
+    def periods(self) -> list[PeriodRecord]:
+        """One record for each control period, the current one last."""
+        return self._radio.periods
 
     @property
     def period(self) -> int:
         """The current control period, from 0."""
-        return self._period
+        return len(self.periods) - 1
+
+    @property
+    def time_s(self) -> float:
+        """When the current control period began, in seconds of simulated time."""
+        return self.period * self._link.period_s
 
     @property
     def snr_db(self) -> float:
         """SNR of the current control period in dB; what a perfect modem would report."""
-        return self._snr_db
+        return self.periods[-1].snr_db
 
     @property
     def capacity_bits(self) -> float:
         """What the link carries in the current control period, bits."""
-        return self._capacity_bits
+        return self.periods[-1].capacity_bits
+
+    @property
+    def backlog_bytes(self) -> int:
+        """Bytes of given-up requests that have to cross before anything newer."""
+        return self._radio.backlog_bytes
+
+    def reading(self, delay_periods: int = 0) -> SnrReading:
+        """What a modem reports that is ``delay_periods`` behind, with its age.
+
+        Before the link is that old, the report is of period 0.
+
+        Raises:
+            LinkError: a negative delay.
+        """
+        if delay_periods < 0:
+            raise LinkError(f"expected delay_periods of at least 0, got {delay_periods}")
+        age = min(delay_periods, self.period)
+        return SnrReading(self.periods[-1 - age].snr_db, age * self._link.period_s)
 
     def advance(self, periods: int = 1) -> None:
-        """Lets control periods pass; whatever capacity was left in them is gone.
+        """Lets control periods pass; capacity that nothing waited for is gone.
 
         Raises:
             ValueError: fewer than one period.
-            LinkError: the channel has no value for the new period.
+            LinkError: the channel has no value for a new period.
         """
         if periods < 1:
             raise ValueError(f"expected periods >= 1, got {periods}: time does not run backwards")
-        value = next(itertools.islice(self._values, periods - 1, None), None)
-        if value is None:
-            raise LinkError(
-                f"the channel ends before period {self._period + periods}: use one without end "
-                "(all of comvla_sim.channel are), or a longer trace"
-            )
-        self._capacity_bits = self._link.capacity_bits(value)
-        self._snr_db = float(value)
-        self._period += periods
-        self._used_bytes = 0
+        for _ in range(periods):
+            self._radio.advance()
 
     def get_model(self, timeout_s: float) -> GetModelResponse:
         """The handshake, which happens before the robot moves and is not limited."""
-        return self._transport.get_model(timeout_s)
+        response = GetModelResponse()
+        response.CopyFrom(self._transport.get_model(timeout_s))
+        response.progressive = True  # it is this link that takes the pieces
+        return response
 
     def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
-        """Carries what fits of a request, and the answer back.
+        """Carries what fits of a request into this period, and the answer back.
 
         Raises:
-            TransportError: ``DEADLINE_EXCEEDED`` when no token arrived whole in this period, and
-                whatever the wrapped transport raises.
+            TransportError: ``DEADLINE_EXCEEDED`` when no token arrived whole in time, and whatever
+                the wrapped transport raises.
         """
-        available_bits = self._capacity_bits - 8 * self._used_bytes
-        room_bytes = max(0, int(available_bits // 8))
-        offered_bytes = self._cost_bytes(request, len(request.payload))
-        kept_bytes = self._fitting_payload_bytes(request, room_bytes)
+        return self.infer_within(request, timeout_s, self._link.window_s)
+
+    def infer_within(
+        self, request: InferRequest, timeout_s: float, window_s: float
+    ) -> InferResponse:
+        """Carries what fits of a request into a window of some periods, and the answer back.
+
+        Args:
+            request: the request.
+            timeout_s: for the wrapped transport, on the wall clock.
+            window_s: seconds in which the payload has to cross. With ``mode="queue"`` it is the
+                robot's patience that counts.
+
+        Raises:
+            TransportError: ``DEADLINE_EXCEEDED`` when no token arrived whole in time, and whatever
+                the wrapped transport raises.
+        """
+        length = len(request.payload)
+        offered_bytes = self._cost_bytes(request, length)
         header = codec.read_header(request.payload)
-        delivered_tokens = min(
-            header.count,
-            codec.prefix_tokens(
-                kept_bytes,
-                header.token_dim,
-                header.quantization,
-                num_towers=len(header.tower_dims),
-            ),
-        )
-        # A request cut before its first whole token still took the air until the period ended.
-        delivered_bytes = min(offered_bytes, room_bytes)
-        if delivered_tokens:
-            delivered_bytes = self._cost_bytes(request, kept_bytes)
-        self._used_bytes += delivered_bytes
-        share = 8 * delivered_bytes / self._capacity_bits if self._capacity_bits else 1.0
-        self.log.append(
-            LinkRecord(
-                period=self._period,
-                snr_db=self._snr_db,
-                capacity_bits=self._capacity_bits,
-                available_bits=available_bits,
-                offered_bytes=offered_bytes,
-                delivered_bytes=delivered_bytes,
-                offered_tokens=header.count,
-                delivered_tokens=delivered_tokens,
-                airtime_s=share * self._link.period_s,
-            )
-        )
-        if not delivered_tokens:
-            raise TransportError(
-                "DEADLINE_EXCEEDED",
-                f"the link carried {delivered_bytes} of {offered_bytes} bytes in its period "
-                f"({self._snr_db:.1f} dB), no token arrived whole: send fewer tokens",
-            )
-        if kept_bytes < len(request.payload):
+        periods = self._patience_periods if self._mode == "queue" else self._span(window_s)
+        asked = _Asked(self)
+        carried_bytes = self._radio.carry(offered_bytes, periods)
+        kept_bytes = 0
+        if carried_bytes == offered_bytes:
+            kept_bytes = length
+        elif self._mode == "prefix":
+            kept_bytes = self._fitting_payload_bytes(request, carried_bytes)
+        tokens = _whole_tokens(header, kept_bytes)
+        self._radio.give_up()
+        self._note(asked, offered_bytes, carried_bytes, header.count, tokens)
+        if not tokens:
+            raise self._lost(asked, offered_bytes, carried_bytes, "no token arrived whole")
+        if kept_bytes < length:
             arrived = InferRequest()
             arrived.CopyFrom(request)
             arrived.payload = request.payload[:kept_bytes]
             request = arrived
         return self._transport.infer(request, timeout_s)
 
+    def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
+        """Carries a payload piece by piece until its window ends, and the answer back.
+
+        Raises:
+            TransportError: ``DEADLINE_EXCEEDED`` when fewer tokens arrived than the robot asks for,
+                and whatever the wrapped transport raises.
+        """
+        costs = self._piece_costs(stream)
+        header = codec.read_header(stream.payload)
+        asked = _Asked(self)
+        carried_bytes = self._radio.carry(costs[-1], self._span(stream.window_s))
+        kept_bytes = self._radio.give_up()
+        whole = [*costs[:-1], costs[-1] - codec.HTTP2_END_BYTES * (self._count == "framed")]
+        arrived = bisect.bisect_right(whole, carried_bytes)
+        stream.taken = min(len(costs), bisect.bisect_right(costs, carried_bytes + kept_bytes) + 1)
+        tokens = _whole_tokens(header, stream.ends[arrived - 1] if arrived else 0)
+        self._note(asked, costs[-1], carried_bytes, header.count, tokens, progressive=True)
+        least = max(1, stream.min_tokens)
+        if tokens < least:
+            found = f"{tokens} whole tokens of at least {least} arrived"
+            raise self._lost(asked, costs[-1], carried_bytes, found)
+        return self._transport.infer(stream.prefix(arrived), timeout_s)
+
     def close(self) -> None:
         """Closes the wrapped transport."""
         self._transport.close()
 
+    def _span(self, window_s: float) -> int:
+        return periods_of(window_s, self._link.period_s, self._link.reserve_s)
+
+    def _note(
+        self,
+        asked: _Asked,
+        offered_bytes: int,
+        carried_bytes: int,
+        offered_tokens: int,
+        tokens: int,
+        *,
+        progressive: bool = False,
+    ) -> None:
+        self.log.append(
+            LinkRecord(
+                period=asked.period,
+                snr_db=asked.snr_db,
+                capacity_bits=asked.capacity_bits,
+                available_bits=asked.available_bits,
+                offered_bytes=offered_bytes,
+                delivered_bytes=carried_bytes,
+                offered_tokens=offered_tokens,
+                delivered_tokens=tokens,
+                airtime_s=self._radio.airtime_s,
+                waited_periods=self.period - asked.period,
+                backlog_bytes=asked.backlog_bytes,
+                progressive=progressive,
+            )
+        )
+
+    def _lost(
+        self, asked: _Asked, offered_bytes: int, carried_bytes: int, found: str
+    ) -> TransportError:
+        waited = self.period - asked.period
+        when = f"in {waited + 1} periods" if waited else "in its period"
+        return TransportError(
+            "DEADLINE_EXCEEDED",
+            f"the link carried {carried_bytes} of {offered_bytes} bytes {when} "
+            f"({asked.snr_db:.1f} dB), {found}: send fewer tokens",
+        )
+
     def _fitting_payload_bytes(self, request: InferRequest, room_bytes: int) -> int:
         """Length of the longest prefix of the payload that fits; 0 where not even the rest does."""
-        length = len(request.payload)
-        if self._cost_bytes(request, length) <= room_bytes:
-            return length
-        if self._mode == "drop":
-            return 0
         fitting = bisect.bisect_right(
-            range(length), room_bytes, key=lambda kept: self._cost_bytes(request, kept)
+            range(len(request.payload)),
+            room_bytes,
+            key=lambda kept: self._cost_bytes(request, kept),
         )
         return max(0, fitting - 1)
+
+    def _piece_costs(self, stream: PayloadStream) -> list[int]:
+        """Bytes on the radio up to the end of each piece."""
+        if self._count == "encoded":
+            return list(stream.ends)
+        return [codec.CALL_HEADERS_BYTES + cost for cost in stream.costs()]
 
     def _cost_bytes(self, request: InferRequest, payload_length: int) -> int:
         """Bytes on the radio for this request with that much of its payload."""
@@ -228,3 +311,22 @@ class EnforcedLink:
             protocol_version=request.protocol_version,
         )
         return codec.wire_bytes(message) + codec.CALL_HEADERS_BYTES
+
+
+class _Asked:
+    """The link as a request found it."""
+
+    def __init__(self, link: EnforcedLink) -> None:
+        current = link.periods[-1]
+        self.period = current.period
+        self.snr_db = current.snr_db
+        self.capacity_bits = current.capacity_bits
+        self.available_bits = current.capacity_bits - 8 * current.delivered_bytes
+        self.backlog_bytes = link.backlog_bytes
+
+
+def _whole_tokens(header: codec.PayloadHeader, length: int) -> int:
+    arrived = codec.prefix_tokens(
+        length, header.token_dim, header.quantization, num_towers=len(header.tower_dims)
+    )
+    return min(header.count, arrived)

@@ -32,6 +32,7 @@ def test_sessions_are_listed_newest_first(
     assert http.get("/v1/sessions").json() == {"count": 0, "sessions": []}
     for session, step, k in (("a", 0, 2), ("a", 1, 4), ("b", 9, 3)):
         robot.infer(message(session, step, k=k))
+    cloud.forget()
     cloud.hold()
     running = robot.send(message("c", 1))
     cloud.wait_until_running()

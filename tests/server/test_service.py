@@ -18,6 +18,7 @@ from server_stubs import (
 )
 
 from comvla import codec
+from comvla.errors import InstructionError
 from comvla.v1 import policy_pb2
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
@@ -254,3 +255,18 @@ def test_an_unknown_method_is_unimplemented(robot: Robot) -> None:
     call = robot.channel.unary_unary("/comvla.v1.PolicyService/Explode")
     code, _ = refusal_of(call.future(b"", timeout=5))
     assert code is grpc.StatusCode.UNIMPLEMENTED
+
+
+def test_words_that_encode_to_many_bytes_still_reach_the_robot(
+    robot: Robot, cloud: StubCloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A status message travels percent-encoded: an emoji takes twelve bytes."""
+
+    def refuse(instruction: str) -> None:
+        raise InstructionError("🙂" * 2000)
+
+    monkeypatch.setattr(cloud, "check_instruction", refuse)
+    for request in (message(), message(session="🙂" * 64), message(instruction="🙂" * 2000)):
+        code, words = robot.refused(request)
+        assert code is grpc.StatusCode.INVALID_ARGUMENT
+        assert "session_id" in words or "instruction" in words

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import string
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -16,8 +18,10 @@ from comvla import codec
 from comvla_server.engine import Engine
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.validation import Validator, content_digest
-from comvla_server.wording import MAX_MESSAGE_CHARS, one_line, shown
+from comvla_server.wording import MAX_ENCODED_BYTES, MAX_MESSAGE_CHARS, one_line, shown
 
+# What gRPC leaves as it is in a status message.
+PRINTABLE = "".join(c for c in string.printable if " " <= c <= "~" and c != "%")
 VALIDATOR = Validator(Engine(StubCloud()), max_request_bytes=4096)
 
 
@@ -174,4 +178,6 @@ def test_text_from_strangers_stays_on_one_printable_line(text: str) -> None:
     line = one_line(text)
     assert len(line) <= MAX_MESSAGE_CHARS
     assert all(c.isprintable() for c in line)
-    assert len(Refusal(Reason.INVALID, text * 50).message) <= MAX_MESSAGE_CHARS
+    message = Refusal(Reason.INVALID, text * 50).message
+    assert len(message) <= MAX_MESSAGE_CHARS
+    assert len(quote(message, safe=PRINTABLE, errors="replace")) <= MAX_ENCODED_BYTES

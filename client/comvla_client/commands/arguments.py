@@ -39,6 +39,7 @@ def add_link(parser: argparse.ArgumentParser) -> None:
         ("bandwidth_hz", "HZ", "bandwidth W in hertz"),
         ("period_s", "S", "control period T in seconds"),
         ("efficiency", "ETA", "share of the Shannon capacity that becomes tokens, eta in (0, 1]"),
+        ("reserve_s", "S", "part of the period kept for round trip and computing, in seconds"),
     ):
         group.add_argument(
             "--" + name.replace("_", "-"),
@@ -61,7 +62,9 @@ def link_of(arguments: argparse.Namespace) -> LinkProfile:
     Raises:
         LinkError: a value out of range.
     """
-    return LinkProfile(arguments.bandwidth_hz, arguments.period_s, arguments.efficiency)
+    return LinkProfile(
+        arguments.bandwidth_hz, arguments.period_s, arguments.efficiency, arguments.reserve_s
+    )
 
 
 def load_edge(source: str) -> EdgeModel:

@@ -16,6 +16,7 @@ from comvla_client.client import ComVLAClient
 from comvla_client.commands.arguments import Subparsers, add_link, add_target, link_of, load_edge
 from comvla_client.report import ActionChunk
 from comvla_client.selection import SELECTORS
+from comvla_client.sending import POLICIES
 
 _DESCRIPTION = """\
 Sends one observation and prints the actions and the report of the step.
@@ -68,6 +69,12 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     )
     parser.add_argument("--tokens", type=int, metavar="K", help="send K tokens whatever the SNR")
     parser.add_argument(
+        "--sending",
+        choices=sorted(POLICIES),
+        default="paper",
+        help="how much is sent when, see docs/edge-sdk.md (default: %(default)s)",
+    )
+    parser.add_argument(
         "--deadline-s", type=float, metavar="S", help="longest that a step may take"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the synthetic observation")
@@ -87,6 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         quantization=arguments.quantization,
         selector=arguments.selector,
         budget="paper" if arguments.tokens is None else arguments.tokens,
+        sending=arguments.sending,
         deadline_s=arguments.deadline_s,
         connect_timeout_s=arguments.connect_timeout_s,
         seed=arguments.seed,
@@ -135,7 +143,9 @@ def _text(chunk: ActionChunk, info: ModelInfo) -> str:
         f"model     {info.name} (N {info.num_tokens}, D {info.token_dim})",
         f"source    {report.source} ({answered}{'; ' + report.detail if report.detail else ''})",
         f"link      {report.snr_db} dB, {report.capacity_bits or 0:.0f} bits a period, "
-        f"K* {report.token_budget}",
+        f"K* {report.paper_budget}, framed {report.framed_budget}",
+        f"policy    {report.policy}: up to {report.token_budget} tokens in "
+        f"{1e3 * report.window_s:.0f} ms, {report.tokens_used} arrived",
         f"sent      {report.tokens} tokens, {report.payload_bytes} B by the paper's accounting, "
         f"{report.encoded_bytes} B coded, {report.framed_bytes} B framed",
         f"robot ms  {' '.join(f'{k} {v}' for k, v in milliseconds.items())}",

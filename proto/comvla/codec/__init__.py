@@ -11,16 +11,26 @@ a payload is a valid, smaller payload: what a fading link lets through can be us
   inverse for a cut payload;
 * :func:`infer_request_bytes`, :func:`wire_bytes`, :func:`request_wire_bytes`: the same up to the
   socket and, where asked, the IP layer;
+* :func:`piece_ends`, :func:`progressive_wire_bytes`: where a stream of pieces is cut, and what it
+  costs up to each cut;
 * :data:`GRPC_OPTIONS`: channel options under which the framing is the one accounted for.
 """
 
 from comvla.codec.accounting import encoded_bytes, payload_bytes, prefix_tokens
 from comvla.codec.layout import MAX_TOKENS, MAX_TOWERS, PayloadHeader, read_header
 from comvla.codec.quantizers import QUANTIZATIONS, bits_per_value
+from comvla.codec.streaming import (
+    piece_ends,
+    progressive_head_bytes,
+    progressive_piece_bytes,
+    progressive_wire_bytes,
+    tokens_per_piece,
+)
 from comvla.codec.tokens import decode, encode
 from comvla.codec.wire import (
     CALL_HEADERS_BYTES,
     GRPC_OPTIONS,
+    HTTP2_END_BYTES,
     HTTP2_FRAME_BYTES,
     infer_request_bytes,
     request_wire_bytes,
@@ -30,6 +40,7 @@ from comvla.codec.wire import (
 __all__ = [
     "CALL_HEADERS_BYTES",
     "GRPC_OPTIONS",
+    "HTTP2_END_BYTES",
     "HTTP2_FRAME_BYTES",
     "MAX_TOKENS",
     "MAX_TOWERS",
@@ -41,8 +52,13 @@ __all__ = [
     "encoded_bytes",
     "infer_request_bytes",
     "payload_bytes",
+    "piece_ends",
     "prefix_tokens",
+    "progressive_head_bytes",
+    "progressive_piece_bytes",
+    "progressive_wire_bytes",
     "read_header",
     "request_wire_bytes",
+    "tokens_per_piece",
     "wire_bytes",
 ]

@@ -23,6 +23,9 @@ from comvla.errors import CodecError
 HTTP2_FRAME_BYTES = 16_384
 """Largest DATA frame that a receiver advertises unless told otherwise (RFC 9113, 6.5.2)."""
 
+HTTP2_END_BYTES = 9
+"""The empty DATA frame by which one side of a stream of messages says that no more will come."""
+
 WRITE_BYTES = 131_072
 """What gRPC hands to the socket at once on a new connection.
 
@@ -149,10 +152,8 @@ def infer_request_bytes(
     texts = (session_id, instruction, model_fingerprint)
     lengths = [len(text.encode()) for text in texts]
     lengths += [4 * proprio_dim, payload_length]
-    total = sum(_TAG_BYTES + _varint_bytes(length) + length for length in lengths if length)
-    total += sum(
-        _TAG_BYTES + _varint_bytes(number) for number in (step, protocol_version) if number
-    )
+    total = sum(_TAG_BYTES + varint_bytes(length) + length for length in lengths if length)
+    total += sum(_TAG_BYTES + varint_bytes(number) for number in (step, protocol_version) if number)
     return total + (_TAG_BYTES + 4) * (snr + snr_age)
 
 
@@ -168,5 +169,6 @@ def _with_tcp_ip(stream_bytes: int, mtu_bytes: int) -> int:
     return stream_bytes + _TCP_IP_HEADER_BYTES * -(-stream_bytes // room)
 
 
-def _varint_bytes(number: int) -> int:
+def varint_bytes(number: int) -> int:
+    """Bytes of a whole number at least 0 in protobuf's variable-length form."""
     return max(1, -(-number.bit_length() // 7))

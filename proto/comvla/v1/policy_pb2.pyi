@@ -26,7 +26,7 @@ class GetModelRequest(_message.Message):
     def __init__(self, protocol_version: _Optional[int] = ...) -> None: ...
 
 class GetModelResponse(_message.Message):
-    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size")
+    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size", "progressive")
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_NAME_FIELD_NUMBER: _ClassVar[int]
     MODEL_FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
@@ -44,6 +44,7 @@ class GetModelResponse(_message.Message):
     MAX_REQUEST_BYTES_FIELD_NUMBER: _ClassVar[int]
     SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
     IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    PROGRESSIVE_FIELD_NUMBER: _ClassVar[int]
     protocol_version: int
     model_name: str
     model_fingerprint: str
@@ -61,7 +62,8 @@ class GetModelResponse(_message.Message):
     max_request_bytes: int
     server_version: str
     image_size: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ...) -> None: ...
+    progressive: bool
+    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ..., progressive: bool = ...) -> None: ...
 
 class InferRequest(_message.Message):
     __slots__ = ("session_id", "step", "instruction", "proprio", "payload", "model_fingerprint", "snr_db", "snr_age_s", "protocol_version")
@@ -110,6 +112,30 @@ class InferResponse(_message.Message):
     load: LoadHint
     model_fingerprint: str
     def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., actions: _Optional[_Iterable[float]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., tokens_used: _Optional[int] = ..., batch_size: _Optional[int] = ..., cloud_flops: _Optional[float] = ..., timings: _Optional[_Union[ServerTimings, _Mapping]] = ..., load: _Optional[_Union[LoadHint, _Mapping]] = ..., model_fingerprint: _Optional[str] = ...) -> None: ...
+
+class InferProgressiveRequest(_message.Message):
+    __slots__ = ("head", "piece")
+    HEAD_FIELD_NUMBER: _ClassVar[int]
+    PIECE_FIELD_NUMBER: _ClassVar[int]
+    head: InferProgressiveHead
+    piece: bytes
+    def __init__(self, head: _Optional[_Union[InferProgressiveHead, _Mapping]] = ..., piece: _Optional[bytes] = ...) -> None: ...
+
+class InferProgressiveHead(_message.Message):
+    __slots__ = ("request", "window_s", "min_tokens")
+    REQUEST_FIELD_NUMBER: _ClassVar[int]
+    WINDOW_S_FIELD_NUMBER: _ClassVar[int]
+    MIN_TOKENS_FIELD_NUMBER: _ClassVar[int]
+    request: InferRequest
+    window_s: float
+    min_tokens: int
+    def __init__(self, request: _Optional[_Union[InferRequest, _Mapping]] = ..., window_s: _Optional[float] = ..., min_tokens: _Optional[int] = ...) -> None: ...
+
+class InferProgressiveResponse(_message.Message):
+    __slots__ = ("response",)
+    RESPONSE_FIELD_NUMBER: _ClassVar[int]
+    response: InferResponse
+    def __init__(self, response: _Optional[_Union[InferResponse, _Mapping]] = ...) -> None: ...
 
 class ServerTimings(_message.Message):
     __slots__ = ("decode_s", "queue_s", "predict_s", "total_s")

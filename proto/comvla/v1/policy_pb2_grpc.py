@@ -25,6 +25,11 @@ class PolicyServiceStub(object):
                 request_serializer=comvla_dot_v1_dot_policy__pb2.InferRequest.SerializeToString,
                 response_deserializer=comvla_dot_v1_dot_policy__pb2.InferResponse.FromString,
                 )
+        self.InferProgressive = channel.stream_unary(
+                '/comvla.v1.PolicyService/InferProgressive',
+                request_serializer=comvla_dot_v1_dot_policy__pb2.InferProgressiveRequest.SerializeToString,
+                response_deserializer=comvla_dot_v1_dot_policy__pb2.InferProgressiveResponse.FromString,
+                )
 
 
 class PolicyServiceServicer(object):
@@ -47,6 +52,17 @@ class PolicyServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def InferProgressive(self, request_iterator, context):
+        """Infer for a link that may not carry everything in time. The first message is a head, all others
+        are pieces of the payload, in order. The server computes on the longest prefix of whole tokens
+        as soon as every token that the payload announces is there, the robot closed its side, or the
+        head's window ended, whichever is first. Idempotent by (session_id, step) as Infer is: a repeat
+        is answered from the record, whatever prefix of its payload arrived this time.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_PolicyServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -59,6 +75,11 @@ def add_PolicyServiceServicer_to_server(servicer, server):
                     servicer.Infer,
                     request_deserializer=comvla_dot_v1_dot_policy__pb2.InferRequest.FromString,
                     response_serializer=comvla_dot_v1_dot_policy__pb2.InferResponse.SerializeToString,
+            ),
+            'InferProgressive': grpc.stream_unary_rpc_method_handler(
+                    servicer.InferProgressive,
+                    request_deserializer=comvla_dot_v1_dot_policy__pb2.InferProgressiveRequest.FromString,
+                    response_serializer=comvla_dot_v1_dot_policy__pb2.InferProgressiveResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -102,5 +123,22 @@ class PolicyService(object):
         return grpc.experimental.unary_unary(request, target, '/comvla.v1.PolicyService/Infer',
             comvla_dot_v1_dot_policy__pb2.InferRequest.SerializeToString,
             comvla_dot_v1_dot_policy__pb2.InferResponse.FromString,
+            options, channel_credentials,
+            insecure, call_credentials, compression, wait_for_ready, timeout, metadata)
+
+    @staticmethod
+    def InferProgressive(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_unary(request_iterator, target, '/comvla.v1.PolicyService/InferProgressive',
+            comvla_dot_v1_dot_policy__pb2.InferProgressiveRequest.SerializeToString,
+            comvla_dot_v1_dot_policy__pb2.InferProgressiveResponse.FromString,
             options, channel_credentials,
             insecure, call_credentials, compression, wait_for_ready, timeout, metadata)

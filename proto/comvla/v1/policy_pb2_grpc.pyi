@@ -15,20 +15,30 @@ from comvla.v1 import policy_pb2 as pb
 
 _GetModel: TypeAlias = grpc.UnaryUnaryMultiCallable[pb.GetModelRequest, pb.GetModelResponse]
 _Infer: TypeAlias = grpc.UnaryUnaryMultiCallable[pb.InferRequest, pb.InferResponse]
+_Progressive: TypeAlias = grpc.StreamUnaryMultiCallable[
+    pb.InferProgressiveRequest, pb.InferProgressiveResponse
+]
 _AioGetModel: TypeAlias = grpc.aio.UnaryUnaryMultiCallable[pb.GetModelRequest, pb.GetModelResponse]
 _AioInfer: TypeAlias = grpc.aio.UnaryUnaryMultiCallable[pb.InferRequest, pb.InferResponse]
+_AioProgressive: TypeAlias = grpc.aio.StreamUnaryMultiCallable[
+    pb.InferProgressiveRequest, pb.InferProgressiveResponse
+]
 
 _G = TypeVar("_G", default=_GetModel)
 _I = TypeVar("_I", default=_Infer)
+_P = TypeVar("_P", default=_Progressive)
 
-class PolicyServiceStub(Generic[_G, _I]):
+class PolicyServiceStub(Generic[_G, _I, _P]):
     GetModel: _G
     Infer: _I
-    @overload
-    def __init__(self: PolicyServiceStub[_GetModel, _Infer], channel: grpc.Channel) -> None: ...
+    InferProgressive: _P
     @overload
     def __init__(
-        self: PolicyServiceStub[_AioGetModel, _AioInfer], channel: grpc.aio.Channel
+        self: PolicyServiceStub[_GetModel, _Infer, _Progressive], channel: grpc.Channel
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: PolicyServiceStub[_AioGetModel, _AioInfer, _AioProgressive], channel: grpc.aio.Channel
     ) -> None: ...
 
 # Stands for both contexts at once, so that a servicer may declare the one that it is served with.
@@ -41,6 +51,9 @@ class PolicyServiceServicer:
     def Infer(
         self, request: pb.InferRequest, context: _ServicerContext
     ) -> pb.InferResponse | Awaitable[pb.InferResponse]: ...
+    def InferProgressive(
+        self, request_iterator: Any, context: _ServicerContext
+    ) -> pb.InferProgressiveResponse | Awaitable[pb.InferProgressiveResponse]: ...
 
 def add_PolicyServiceServicer_to_server(
     servicer: PolicyServiceServicer, server: grpc.Server | grpc.aio.Server
@@ -51,3 +64,5 @@ class PolicyService:
     def GetModel(request: pb.GetModelRequest, target: str, *args: Any, **kwargs: Any) -> Any: ...
     @staticmethod
     def Infer(request: pb.InferRequest, target: str, *args: Any, **kwargs: Any) -> Any: ...
+    @staticmethod
+    def InferProgressive(request_iterator: Any, target: str, *args: Any, **kwargs: Any) -> Any: ...

@@ -7,6 +7,7 @@ import time
 from comvla import codec, handshake
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse, ServerTimings
 from comvla_client.errors import TransportError
+from comvla_client.streaming import PayloadStream
 from comvla_server.engine import CloudHalf, Engine
 from comvla_server.refusals import Refusal
 from comvla_server.service import STATUS
@@ -38,6 +39,7 @@ class InProcessTransport:
             quantizations=codec.QUANTIZATIONS,
             max_request_bytes=self._max_request_bytes,
             server_version=server_version(),
+            progressive=True,
         )
 
     def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
@@ -71,6 +73,15 @@ class InProcessTransport:
             ),
             model_fingerprint=self._engine.info.fingerprint,
         )
+
+    def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
+        """Actions for a payload in pieces, all of which arrive here.
+
+        Raises:
+            TransportError: with the status code and message that a server would send.
+        """
+        stream.taken = len(stream.ends)
+        return self.infer(stream.prefix(stream.taken), timeout_s)
 
     def close(self) -> None:
         """Nothing to close."""
