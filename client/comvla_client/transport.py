@@ -11,6 +11,7 @@ from comvla.model_info import PROTOCOL_VERSION
 from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
 from comvla_client import channel
+from comvla_client.access import Access, TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 
 __all__ = ["GrpcTransport", "Transport", "TransportError"]
@@ -48,13 +49,25 @@ class GrpcTransport:
 
     Args:
         target: ``host:port``.
+        tls: encrypts; None sends in the clear.
+        token: says who calls.
+        insecure: lets the token cross a network in the clear.
 
     Raises:
         HandshakeError: the target is no such address.
+        AccessError: certificates or a token that cannot be used.
     """
 
-    def __init__(self, target: str) -> None:
-        self.target = channel.check_target(target)
+    def __init__(
+        self,
+        target: str,
+        tls: TlsOptions | None = None,
+        token: Token | None = None,
+        *,
+        insecure: bool = False,
+    ) -> None:
+        self.target = target
+        self._access = Access(target, tls, token, insecure=insecure)
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._unanswered = 0
@@ -109,7 +122,9 @@ class GrpcTransport:
         try:
             with self._lock:
                 stub = policy_pb2_grpc.PolicyServiceStub(self._channel)
-            call = getattr(stub, method).future(request, timeout=timeout_s)
+            call = getattr(stub, method).future(
+                request, timeout=timeout_s, metadata=self._access.metadata()
+            )
             # gRPC's own timer may fire late; this wait does not.
             return call.result(timeout=timeout_s)
         except grpc.FutureTimeoutError:
@@ -134,7 +149,7 @@ class GrpcTransport:
         stale.close()
 
     def _new_channel(self) -> grpc.Channel:
-        return grpc.insecure_channel(self.target, options=channel.CHANNEL_OPTIONS)
+        return self._access.channel()
 
     def _closed_error(self) -> ClientClosedError:
         return ClientClosedError(f"the connection to {self.target} was closed: make a new client")

@@ -12,6 +12,7 @@ from comvla.model_info import PROTOCOL_VERSION
 from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
 from comvla_client import channel
+from comvla_client.access import Access, TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 
 
@@ -36,13 +37,25 @@ class GrpcAioTransport:
 
     Args:
         target: ``host:port``.
+        tls: encrypts; None sends in the clear.
+        token: says who calls.
+        insecure: lets the token cross a network in the clear.
 
     Raises:
         HandshakeError: the target is no such address.
+        AccessError: certificates or a token that cannot be used.
     """
 
-    def __init__(self, target: str) -> None:
-        self.target = channel.check_target(target)
+    def __init__(
+        self,
+        target: str,
+        tls: TlsOptions | None = None,
+        token: Token | None = None,
+        *,
+        insecure: bool = False,
+    ) -> None:
+        self.target = target
+        self._access = Access(target, tls, token, insecure=insecure)
         self._closed = asyncio.Event()
         self._unanswered = 0
         self._channel: grpc.aio.Channel | None = None
@@ -92,11 +105,12 @@ class GrpcAioTransport:
             raise self._closed_error()
         if self._channel is None:
             # Made here and not before, because a channel belongs to the loop that runs.
-            self._channel = grpc.aio.insecure_channel(self.target, options=channel.CHANNEL_OPTIONS)
+            self._channel = self._access.aio_channel()
         call = getattr(policy_pb2_grpc.PolicyServiceStub(self._channel), method)
         try:
+            answer = call(request, timeout=timeout_s, metadata=self._access.metadata())
             # gRPC's own timer may fire late; this wait does not.
-            return await asyncio.wait_for(call(request, timeout=timeout_s), timeout_s)
+            return await asyncio.wait_for(answer, timeout_s)
         except asyncio.TimeoutError:
             self._unanswered += 1
             raise channel.unanswered(timeout_s) from None
