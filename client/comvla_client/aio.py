@@ -9,6 +9,7 @@ from types import TracebackType
 
 from comvla.model_info import ModelInfo
 from comvla_client import channel
+from comvla_client.access import TlsOptions, Token, check_unused
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.core import ClientCore, Prepared
 from comvla_client.edge import EdgeModel
@@ -49,6 +50,9 @@ class AsyncComVLAClient:
         session_id: str | None = None,
         seed: int = 0,
         connect_timeout_s: float = 5.0,
+        tls: TlsOptions | None = None,
+        token: Token | None = None,
+        insecure: bool = False,
     ) -> None:
         self._core = ClientCore(
             edge,
@@ -69,7 +73,13 @@ class AsyncComVLAClient:
         self._lock = asyncio.Lock()
         self._connected = False
         self._closed = False
-        self._transport = GrpcAioTransport(target) if isinstance(target, str) else target
+        if isinstance(target, str):
+            self._transport: AsyncTransport = GrpcAioTransport(
+                target, tls, token, insecure=insecure
+            )
+        else:
+            check_unused(tls, token, insecure)
+            self._transport = target
         self._core.check_transport(self._transport)
 
     @property

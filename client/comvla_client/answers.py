@@ -27,6 +27,10 @@ _FALLBACKS: dict[str, FallbackReason] = {
     "UNKNOWN": "rejected",
     "CANCELLED": "rejected",
     "DATA_LOSS": "rejected",
+    # At the start these raise. Later a token was revoked, or is being renewed: the robot holds, and
+    # goes on by itself when it is let in again.
+    "UNAUTHENTICATED": "unauthorized",
+    "PERMISSION_DENIED": "unauthorized",
 }
 # gRPC's words and the server's for a message that is too large, which no waiting makes smaller.
 _OVERSIZE = ("larger than max", "request of at most")

@@ -9,6 +9,7 @@ import grpc
 from comvla import codec
 from comvla.errors import HandshakeError
 from comvla_client.errors import TransportError
+from comvla_client.locked_out import locked_out
 
 MAX_MESSAGE_BYTES = 16 * 2**20
 """Largest message either way: 512 float32 tokens of width 2176 are 4.3 MiB."""
@@ -91,7 +92,7 @@ class Attempts:
             # The clock only cut short the last of several attempts to reach a server that is gone.
             raise self._unavailable
         pause_s = self._pause_s
-        if error.code != "UNAVAILABLE" or _speaks_no_http2(error) or self.remaining_s() <= pause_s:
+        if error.code != "UNAVAILABLE" or _hopeless(error) or self.remaining_s() <= pause_s:
             raise error
         self._unavailable = error
         self._pause_s = min(2 * pause_s, self.LONGEST_PAUSE_S)
@@ -116,12 +117,20 @@ def unanswered(timeout_s: float) -> TransportError:
 
 def no_server(target: str, error: TransportError, budget_s: float) -> HandshakeError:
     """Why a client could not be made, with host, budget and remedy."""
+    distrust = locked_out(error)
+    if distrust is not None:
+        return HandshakeError(
+            f"found a server at {target}, but {distrust} `comvla doctor` looks closer "
+            f"({error.code}: {error.message})"
+        )
     if error.code == "UNIMPLEMENTED":
         found = "a gRPC server answered that offers no comvla.v1.PolicyService."
     elif _speaks_no_http2(error):
         found = "what answered does not speak gRPC: a web server, or the admin surface?"
     elif error.code == "DEADLINE_EXCEEDED":
         found = "nothing spoke gRPC in time."
+    elif "Socket closed" in error.message or "Connection reset" in error.message:
+        found = "it hung up at once: it may ask for TLS, or for a certificate of this robot."
     else:
         found = "no server was ready."
     return HandshakeError(
@@ -131,6 +140,10 @@ def no_server(target: str, error: TransportError, budget_s: float) -> HandshakeE
     )
 
 
+def _hopeless(error: TransportError) -> bool:
+    # What answered will not turn into a trusted gRPC server by waiting.
+    return _speaks_no_http2(error) or locked_out(error) is not None
+
+
 def _speaks_no_http2(error: TransportError) -> bool:
-    # What answered will not turn into a gRPC server by waiting.
     return "parsing HTTP/2" in error.message

@@ -9,6 +9,7 @@ from types import TracebackType
 
 from comvla.model_info import ModelInfo
 from comvla_client import channel
+from comvla_client.access import TlsOptions, Token, check_unused
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.core import ClientCore, Prepared
 from comvla_client.edge import EdgeModel
@@ -59,9 +60,16 @@ class ComVLAClient:
         session_id: a name for this robot in the server's view; a random part is added.
         seed: for selectors that draw; the same seed draws the same at each step of each episode.
         connect_timeout_s: longest that the constructor waits for a server, in seconds.
+        tls: encrypts the link: whom to trust, and the robot's own certificate for mutual TLS. None
+            sends everything in the clear.
+        token: says who calls, where the server asks: text, or a path or function that is asked at
+            every call, so that it can be renewed while the robot runs.
+        insecure: lets a token cross a network in the clear, e.g. inside a tunnel.
 
     Raises:
-        HandshakeError: no ComVLA server at the target in time, or one with another model.
+        HandshakeError: no ComVLA server at the target in time, one with another model, or one that
+            does not let this robot in.
+        AccessError: certificates or a token that cannot be used.
         ValueError: an option out of range.
     """
 
@@ -83,6 +91,9 @@ class ComVLAClient:
         session_id: str | None = None,
         seed: int = 0,
         connect_timeout_s: float = 5.0,
+        tls: TlsOptions | None = None,
+        token: Token | None = None,
+        insecure: bool = False,
     ) -> None:
         self._core = ClientCore(
             edge,
@@ -101,7 +112,11 @@ class ComVLAClient:
         )
         self._lock = threading.RLock()
         self._closed = False
-        self._transport = GrpcTransport(target) if isinstance(target, str) else target
+        if isinstance(target, str):
+            self._transport: Transport = GrpcTransport(target, tls, token, insecure=insecure)
+        else:
+            check_unused(tls, token, insecure)
+            self._transport = target
         try:
             self._core.check_transport(self._transport)
             self._shake_hands(connect_timeout_s)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import grpc
 
 from comvla_client import channel
+from comvla_client.access import Access
 
 _STATUS = {0: "UNKNOWN", 1: "SERVING", 2: "NOT_SERVING", 3: "SERVICE_UNKNOWN"}
 
 
-def check_health(target: str, timeout_s: float) -> str:
+def check_health(access: Access, timeout_s: float) -> str:
     """What the server says of its own health.
 
     Args:
-        target: ``host:port``.
+        access: how to reach it.
         timeout_s: longest to wait, in seconds.
 
     Returns:
@@ -22,7 +23,7 @@ def check_health(target: str, timeout_s: float) -> str:
     Raises:
         TransportError: no answer, or no health service there.
     """
-    with grpc.insecure_channel(target, options=channel.CHANNEL_OPTIONS) as connection:
+    with access.channel() as connection:
         # Both messages have one field, so their bytes are spelled out here: an empty request asks
         # about the whole server, and the answer is the field tag 0x08 and one digit.
         check: grpc.UnaryUnaryMultiCallable[bytes, bytes]

@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 Source: TypeAlias = Literal["cloud", "rest", "hold"]
-FallbackReason: TypeAlias = Literal["no_link", "deadline", "unavailable", "overloaded", "rejected"]
+FallbackReason: TypeAlias = Literal[
+    "no_link", "deadline", "unavailable", "overloaded", "rejected", "unauthorized"
+]
 
 PHASES = ("encode", "project", "score", "select", "quantize", "call", "total")
 

@@ -12,12 +12,14 @@ from comvla.model_info import PROTOCOL_VERSION
 from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
 from comvla_client import channel
+from comvla_client.access import Access, Metadata, TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.streaming import PayloadStream, paced
 
 __all__ = ["GrpcTransport", "ProgressiveTransport", "Transport", "TransportError"]
 
-Start = Callable[[Any, float], Any]
+Start = Callable[[Any, float, Metadata], Any]
+"""Begins a call: a stub, seconds, and what proves who calls."""
 
 
 class Transport(Protocol):
@@ -64,13 +66,25 @@ class GrpcTransport:
 
     Args:
         target: ``host:port``.
+        tls: encrypts; None sends in the clear.
+        token: says who calls.
+        insecure: lets the token cross a network in the clear.
 
     Raises:
         HandshakeError: the target is no such address.
+        AccessError: certificates or a token that cannot be used.
     """
 
-    def __init__(self, target: str) -> None:
-        self.target = channel.check_target(target)
+    def __init__(
+        self,
+        target: str,
+        tls: TlsOptions | None = None,
+        token: Token | None = None,
+        *,
+        insecure: bool = False,
+    ) -> None:
+        self.target = target
+        self._access = Access(target, tls, token, insecure=insecure)
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._unanswered = 0
@@ -110,12 +124,12 @@ class GrpcTransport:
         """
         stopped = threading.Event()
 
-        def start(stub: Any, remaining_s: float) -> Any:
+        def start(stub: Any, remaining_s: float, metadata: Metadata) -> Any:
             nonlocal stopped
             stopped.set()
             stopped = threading.Event()
             messages = paced(stream, min(stream.window_s, remaining_s), stopped)
-            return stub.InferProgressive.future(messages, timeout=remaining_s)
+            return stub.InferProgressive.future(messages, timeout=remaining_s, metadata=metadata)
 
         try:
             answer: InferResponse = self._call(start, timeout_s).response
@@ -151,7 +165,7 @@ class GrpcTransport:
         try:
             with self._lock:
                 stub = policy_pb2_grpc.PolicyServiceStub(self._channel)
-            call = start(stub, timeout_s)
+            call = start(stub, timeout_s, self._access.metadata())
             # gRPC's own timer may fire late; this wait does not.
             return call.result(timeout=timeout_s)
         except grpc.FutureTimeoutError:
@@ -176,11 +190,13 @@ class GrpcTransport:
         stale.close()
 
     def _new_channel(self) -> grpc.Channel:
-        return grpc.insecure_channel(self.target, options=channel.CHANNEL_OPTIONS)
+        return self._access.channel()
 
     def _closed_error(self) -> ClientClosedError:
         return ClientClosedError(f"the connection to {self.target} was closed: make a new client")
 
 
 def _unary(method: str, request: Any) -> Start:
-    return lambda stub, timeout_s: getattr(stub, method).future(request, timeout=timeout_s)
+    return lambda stub, timeout_s, metadata: getattr(stub, method).future(
+        request, timeout=timeout_s, metadata=metadata
+    )

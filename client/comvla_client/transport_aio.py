@@ -13,10 +13,12 @@ from comvla.model_info import PROTOCOL_VERSION
 from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest, InferResponse
 from comvla_client import channel
+from comvla_client.access import Access, Metadata, TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.streaming import PayloadStream, paced_async
 
-Start = Callable[[Any, float], Any]
+Start = Callable[[Any, float, Metadata], Any]
+"""Begins a call: a stub, seconds, and what proves who calls."""
 
 
 class AsyncTransport(Protocol):
@@ -48,13 +50,25 @@ class GrpcAioTransport:
 
     Args:
         target: ``host:port``.
+        tls: encrypts; None sends in the clear.
+        token: says who calls.
+        insecure: lets the token cross a network in the clear.
 
     Raises:
         HandshakeError: the target is no such address.
+        AccessError: certificates or a token that cannot be used.
     """
 
-    def __init__(self, target: str) -> None:
-        self.target = channel.check_target(target)
+    def __init__(
+        self,
+        target: str,
+        tls: TlsOptions | None = None,
+        token: Token | None = None,
+        *,
+        insecure: bool = False,
+    ) -> None:
+        self.target = target
+        self._access = Access(target, tls, token, insecure=insecure)
         self._closed = asyncio.Event()
         self._unanswered = 0
         self._channel: grpc.aio.Channel | None = None
@@ -88,9 +102,9 @@ class GrpcAioTransport:
             ClientClosedError: the transport is closed, before or during the call.
         """
 
-        def start(stub: Any, remaining_s: float) -> Any:
+        def start(stub: Any, remaining_s: float, metadata: Metadata) -> Any:
             messages = paced_async(stream, min(stream.window_s, remaining_s))
-            return stub.InferProgressive(messages, timeout=remaining_s)
+            return stub.InferProgressive(messages, timeout=remaining_s, metadata=metadata)
 
         answer: InferResponse = (await self._call(start, timeout_s)).response
         return answer
@@ -119,11 +133,12 @@ class GrpcAioTransport:
             raise self._closed_error()
         if self._channel is None:
             # Made here and not before, because a channel belongs to the loop that runs.
-            self._channel = grpc.aio.insecure_channel(self.target, options=channel.CHANNEL_OPTIONS)
+            self._channel = self._access.aio_channel()
         stub = policy_pb2_grpc.PolicyServiceStub(self._channel)
         try:
+            answer = start(stub, timeout_s, self._access.metadata())
             # gRPC's own timer may fire late; this wait does not.
-            return await asyncio.wait_for(start(stub, timeout_s), timeout_s)
+            return await asyncio.wait_for(answer, timeout_s)
         except asyncio.TimeoutError:
             self._unanswered += 1
             raise channel.unanswered(timeout_s) from None
@@ -149,4 +164,6 @@ class GrpcAioTransport:
 
 
 def _unary(method: str, request: Any) -> Start:
-    return lambda stub, timeout_s: getattr(stub, method)(request, timeout=timeout_s)
+    return lambda stub, timeout_s, metadata: getattr(stub, method)(
+        request, timeout=timeout_s, metadata=metadata
+    )

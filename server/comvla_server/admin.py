@@ -44,6 +44,7 @@ class SessionDescription(BaseModel):
     """One robot's session."""
 
     session_id: str
+    identity: str
     newest_step: int
     answers: int
     waiting: bool
@@ -155,6 +156,7 @@ def _describe_sessions(runtime: Runtime, limit: int) -> SessionList:
         sessions=[
             SessionDescription(
                 session_id=session.session_id,
+                identity=session.owner,
                 newest_step=session.newest_step,
                 answers=session.answers,
                 waiting=session.queued is not None,

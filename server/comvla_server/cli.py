@@ -7,7 +7,13 @@ import sys
 from collections.abc import Sequence
 
 from comvla.errors import ComVLAError
-from comvla_server import inspect_command, serve_command, split_command
+from comvla_server import (
+    config_command,
+    inspect_command,
+    serve_command,
+    split_command,
+    token_command,
+)
 from comvla_server.version import server_version
 
 _DESCRIPTION = """\
@@ -21,11 +27,13 @@ _EPILOG = """\
 examples:
   comvla-server serve --model mini              the shipped policy, on this machine only
   comvla-server serve --port 0 --admin-port 0   free ports; the ready line names them
+  comvla-server config --max-batch 4            every setting in force, and where it came from
+  comvla-server token new arm-7 --file tokens   a token for the robot arm-7
   comvla-server inspect mini                    what a checkpoint is and what a step costs
   comvla-server split SRC DST --check           halves of a published checkpoint
   curl http://127.0.0.1:8080/metrics            what Prometheus scrapes
 
-exit codes: 0 done, 1 calls were cut off or something broke, 2 a wrong option, model or port
+exit codes: 0 done, 1 calls were cut off or something broke, 2 a wrong setting, file, model or port
 """
 
 
@@ -40,6 +48,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"comvla {server_version()}")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     serve_command.add_parser(subparsers)
+    config_command.add_parser(subparsers)
+    token_command.add_parser(subparsers)
     inspect_command.add_parser(subparsers)
     split_command.add_parser(subparsers)
     return parser

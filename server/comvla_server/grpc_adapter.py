@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,10 +30,14 @@ class _Malformed:
     size_bytes: int
 
 
-def make_grpc_server(settings: ServerSettings) -> grpc.aio.Server:
+def make_grpc_server(
+    settings: ServerSettings, interceptors: Sequence[grpc.aio.ServerInterceptor] = ()
+) -> grpc.aio.Server:
     """A grpc.aio server with this project's limits and keepalive; needs a running event loop."""
     return grpc.aio.server(
-        options=server_options(settings), maximum_concurrent_rpcs=settings.max_concurrent_calls
+        interceptors=interceptors,
+        options=server_options(settings),
+        maximum_concurrent_rpcs=settings.max_concurrent_calls,
     )
 
 
@@ -43,19 +47,32 @@ def server_options(settings: ServerSettings) -> list[tuple[str, int]]:
     Clients ping every 10 s, with or without calls. gRPC's default is to end a connection that pings
     more often than every five minutes (GOAWAY, too_many_pings), hence ``min_ping_interval_s``.
     """
-    min_ping_ms = max(1, round(1000 * settings.min_ping_interval_s))
     return [
         *codec.GRPC_OPTIONS,
         # Two servers on one port would silently share its robots.
         ("grpc.so_reuseport", 0),
         ("grpc.max_receive_message_length", int(_WORDS_UP_TO * settings.max_request_bytes)),
         ("grpc.keepalive_permit_without_calls", 1),
-        ("grpc.http2.min_ping_interval_without_data_ms", min_ping_ms),
+        ("grpc.http2.min_ping_interval_without_data_ms", _ms(settings.min_ping_interval_s)),
         # The server's own pings find robots that vanished without a word, idle ones too.
         ("grpc.keepalive_time_ms", 30_000),
         ("grpc.keepalive_timeout_ms", 10_000),
         ("grpc.http2.max_pings_without_data", 0),
+        # What strangers can hold on to: connections, handshakes, streams, headers, each bounded.
+        ("grpc.max_allowed_incoming_connections", settings.max_connections),
+        ("grpc.server_handshake_timeout_ms", _ms(settings.handshake_timeout_s)),
+        ("grpc.max_concurrent_streams", settings.max_calls_per_connection),
+        ("grpc.max_connection_idle_ms", _ms(settings.connection_idle_s)),
+        ("grpc.max_connection_age_ms", _ms(settings.connection_age_s)),
+        ("grpc.max_connection_age_grace_ms", _ms(max(settings.grace_s, 1.0))),
+        # Between the two gRPC refuses some at random; here there is no between.
+        ("grpc.max_metadata_size", settings.max_metadata_bytes),
+        ("grpc.absolute_max_metadata_size", settings.max_metadata_bytes),
     ]
+
+
+def _ms(seconds: float) -> int:
+    return min(2**31 - 1, max(1, round(1000 * seconds)))
 
 
 def add_policy_service(server: grpc.aio.Server, service: PolicyService) -> None:

@@ -16,6 +16,9 @@ SECONDS_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.1
 TOKEN_BUCKETS = (1, 4, 8, 16, 32, 48, 64, 96, 128, 256, 512)
 BATCH_BUCKETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
+DOOR_REASONS = (Reason.NO_IDENTITY, Reason.RATE, Reason.OVERSIZE, Reason.SLOW)
+"""Why a call can be turned away before it reaches a service."""
+
 
 class Metrics:
     """All counters of one server, in a registry of its own: two servers can share a process.
@@ -85,9 +88,29 @@ class Metrics:
             ["ending"],
             registry=self.registry,
         )
+        self.calls_refused = Counter(
+            "comvla_calls_refused",
+            "Calls turned away before they reached a service, by reason.",
+            ["reason"],
+            registry=self.registry,
+        )
+        self.reload_failures = Counter(
+            "comvla_reload_failures",
+            "Files that changed and could not be used; the old content stays in force.",
+            ["file"],
+            registry=self.registry,
+        )
+        self.certificate_not_after = Gauge(
+            "comvla_certificate_not_after_seconds",
+            "When a certificate in use expires, seconds since 1970; no series without TLS.",
+            ["certificate"],
+            registry=self.registry,
+        )
         # Every series exists from the start: a rate over a late one loses its first step.
         for reason in Reason:
             self.requests_dropped.labels(reason.value)
+        for reason in DOOR_REASONS:
+            self.calls_refused.labels(reason.value)
         for phase in ("collect", "decode", "queue", "predict"):
             self.step_phase.labels(phase)
         for ending in ENDINGS:

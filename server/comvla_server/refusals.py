@@ -24,6 +24,10 @@ class Reason(str, Enum):
     LOADING = "loading"  # the model is not ready yet
     DRAINING = "draining"  # the server is stopping
     MODEL = "model"  # the model failed
+    NO_IDENTITY = "no_identity"  # no token, or one that nobody has
+    NOT_OWNER = "not_owner"  # the session of another identity
+    RATE = "rate"  # more calls or bytes than this identity may send
+    SLOW = "slow"  # the request did not arrive in time
 
 
 class Refusal(ComVLAError):

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import logging
-import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import grpc
-import uvicorn
 
 from comvla import codec
 from comvla.model_info import ModelInfo
+from comvla_server.access import Access
 from comvla_server.admin import create_app
+from comvla_server.admin_http import AdminHttp
 from comvla_server.batcher import Batcher
 from comvla_server.engine import Engine
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
@@ -64,8 +63,9 @@ class Server:
         self._health = HealthReporter()
         self._service: PolicyService | None = None
         self._grpc: grpc.aio.Server | None = None
-        self._admin: _QuietUvicorn | None = None
-        self._admin_task: asyncio.Task[None] | None = None
+        self._admin: AdminHttp | None = None
+        self._access: Access | None = None
+        self._watching: asyncio.Task[None] | None = None
         self._thread: InferenceThread | None = None
 
     @property
@@ -76,7 +76,8 @@ class Server:
     @property
     def admin_url(self) -> str:
         """Root of the admin surface."""
-        return f"http://{authority(self.settings.host, self.admin_port)}"
+        scheme = "https" if self.settings.tls else "http"
+        return f"{scheme}://{authority(self.settings.admin_address, self.admin_port)}"
 
     async def start(self) -> None:
         """Binds, loads, warms up; returns when calls are answered.
@@ -97,24 +98,31 @@ class Server:
 
         Raises:
             BindError: a port is taken.
+            SettingsError: a certificate, key or tokens file cannot be used.
         """
         settings = self.settings
-        server = make_grpc_server(settings)
+        access = Access(settings, self.metrics)
+        server = make_grpc_server(settings, [access.door])
         service = PolicyService(self.lifecycle, self.metrics, settings)
         add_policy_service(server, service)
         await self._health.register(server)
-        admin_socket = listen(settings.host, settings.admin_port, "--admin-port")
+        admin_socket = listen(settings.admin_address, settings.admin_port, "--admin-port")
         try:
-            self.port = add_grpc_port(server, settings.host, settings.port)
+            self.port = add_grpc_port(
+                server, settings.host, settings.port, access.grpc_credentials()
+            )
         except BaseException:
             admin_socket.close()
             raise
         self.admin_port = admin_socket.getsockname()[1]
         self._service, self._grpc = service, server
         self.metrics.watch_ready(lambda: self.lifecycle.ready)
-        self._start_admin(service, admin_socket)
+        app = access.guard(create_app(self.lifecycle, self.metrics, service, settings))
+        self._admin = AdminHttp(app, admin_socket, settings, access.https_context())
+        self._admin.start()
         await server.start()
-        self._warn_if_open()
+        self._access = access
+        self._watching = asyncio.create_task(access.watch())
 
     async def make_ready(self) -> ModelInfo:
         """Loads and warms up in the inference thread, then says SERVING.
@@ -159,6 +167,11 @@ class Server:
         _log.info("serving %s", engine.info.name, extra={"grpc": self.target})
         return engine.info
 
+    def reload(self) -> None:
+        """Looks now for certificates and tokens that have changed, instead of a little later."""
+        if self._access is not None:
+            self._access.look()
+
     async def stop(self, grace_s: float | None = None) -> bool:
         """Drains and stops: refuses new calls, lets those in flight finish, then closes the ports.
 
@@ -173,9 +186,10 @@ class Server:
         finished = await self._drain(self.settings.grace_s if grace_s is None else grace_s)
         if self._grpc is not None:
             await self._grpc.stop(_FLUSH_S)
-        if self._admin is not None and self._admin_task is not None:
-            self._admin.should_exit = True
-            await self._admin_task
+        if self._admin is not None:
+            await self._admin.stop()
+        if self._watching is not None:
+            self._watching.cancel()
         if self._thread is not None:
             self._thread.close(timeout_s=1.0 if finished else 0.0)
         self.lifecycle.enter(Phase.STOPPED)
@@ -193,19 +207,6 @@ class Server:
             await self._service.runtime.batcher.close()
         return finished
 
-    def _start_admin(self, service: PolicyService, admin_socket: socket.socket) -> None:
-        app = create_app(self.lifecycle, self.metrics, service, self.settings)
-        config = uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            lifespan="off",
-            ws="none",
-            timeout_graceful_shutdown=1,
-        )
-        self._admin = _QuietUvicorn(config)
-        self._admin_task = asyncio.create_task(self._admin.serve(sockets=[admin_socket]))
-
     def _check_message_cap(self, engine: Engine) -> None:
         info = engine.info
         payload_bytes = codec.encoded_bytes(
@@ -217,22 +218,3 @@ class Server:
                 f"max_request_bytes is {self.settings.max_request_bytes}, an unpruned float32 "
                 f"observation of {info.name} needs {needed}: raise --max-request-bytes"
             )
-
-    def _warn_if_open(self) -> None:
-        with contextlib.suppress(ValueError):
-            if ipaddress.ip_address(self.settings.host).is_loopback:
-                return
-        if self.settings.host != "localhost":
-            _log.warning(
-                "listening beyond this machine on %s without authentication: "
-                "keep it in a trusted network",
-                self.settings.host,
-            )
-
-
-class _QuietUvicorn(uvicorn.Server):
-    """uvicorn without its signal handlers: one place decides when this process stops."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield

@@ -40,6 +40,10 @@ STATUS = {
     Reason.LOADING: grpc.StatusCode.UNAVAILABLE,
     Reason.DRAINING: grpc.StatusCode.UNAVAILABLE,
     Reason.MODEL: grpc.StatusCode.INTERNAL,
+    Reason.NO_IDENTITY: grpc.StatusCode.UNAUTHENTICATED,
+    Reason.NOT_OWNER: grpc.StatusCode.PERMISSION_DENIED,
+    Reason.RATE: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Reason.SLOW: grpc.StatusCode.DEADLINE_EXCEEDED,
 }
 
 

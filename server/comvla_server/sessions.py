@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from comvla_server.identity import caller
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.tickets import Answer, Ticket
 from comvla_server.wording import shown
@@ -18,6 +19,7 @@ class Session:
     Attributes:
         session_id: name chosen by the robot.
         last_seen_s: monotonic time of its last call.
+        owner: name of the identity that opened it; empty where the server asks nobody who they are.
         newest_step: highest step admitted so far, -1 before the first.
         queued: its observation that waits, at most one.
         running: its observation inside the model, at most one.
@@ -27,6 +29,7 @@ class Session:
 
     session_id: str
     last_seen_s: float
+    owner: str = ""
     newest_step: int = -1
     queued: Ticket | None = None
     running: Ticket | None = None
@@ -79,7 +82,11 @@ def superseded(session_id: str, step: int, newest_step: int) -> Refusal:
 
 
 class SessionTable:
-    """Sessions by name, bounded: the least recently seen one that is idle leaves first."""
+    """Sessions by name, bounded: the least recently seen one that is idle leaves first.
+
+    A session belongs to the identity whose call opened it. The table itself asks who calls, so that
+    no way to a session can forget to.
+    """
 
     def __init__(self, max_sessions: int, ttl_s: float) -> None:
         self._max_sessions = max_sessions
@@ -94,20 +101,36 @@ class SessionTable:
         return iter(self._sessions.values())
 
     def get(self, session_id: str, now_s: float) -> Session | None:
-        """The session, or None where it is unknown or was silent for too long."""
+        """The session, or None where it is unknown or was silent for too long.
+
+        Raises:
+            Refusal: it belongs to another identity than the caller's.
+        """
         session = self._sessions.get(session_id)
         if session is None:
             return None
         if session.idle and now_s - session.last_seen_s > self._ttl_s:
             del self._sessions[session_id]
             return None
+        if session.owner != caller().name:
+            raise Refusal(
+                Reason.NOT_OWNER,
+                f"session {shown(session_id)} belongs to another identity than "
+                f"{shown(caller().name)}: expected a session of this robot's own; choose another "
+                "session_id, or use the token of the robot that opened it",
+            )
         return session
 
     def touch(self, session_id: str, now_s: float) -> Session:
-        """The session, made where it is new; it becomes the most recently seen."""
+        """The session, made for the caller where it is new; it becomes the most recently seen.
+
+        Raises:
+            Refusal: it belongs to another identity than the caller's.
+        """
         session = self.get(session_id, now_s)
         if session is None:
-            session = self._sessions[session_id] = Session(session_id, now_s)
+            session = Session(session_id, now_s, caller().name)
+            self._sessions[session_id] = session
         session.last_seen_s = now_s
         self._sessions.move_to_end(session_id)
         self._evict(session, now_s)

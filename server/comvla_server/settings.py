@@ -1,91 +1,252 @@
-"""What an operator may choose about a server."""
+"""What an operator may choose about a server: the one model of its settings."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from pathlib import Path
 
-from comvla.errors import ComVLAError
+from comvla_server.contradictions import check_together
+from comvla_server.setting_fields import SettingsError, check_value, fields_of, setting
+
+__all__ = ["ServerSettings", "SettingsError"]
+
+MODEL, NETWORK, TLS = "model", "network", "encryption"
+ACCESS, LIMITS, CONNECTIONS = "who may call", "limits", "connections"
+LOGS = "logs, on stderr"
 
 
-class SettingsError(ComVLAError, ValueError):
-    """A server setting that makes no sense; the message names the range and the remedy."""
+def _fastv(text: str) -> tuple[int, float]:
+    layer, _, drop = text.partition(",")
+    return int(layer), float(drop)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ServerSettings:
     """Settings of one :class:`comvla_server.server.Server`, checked when they are made.
 
-    Attributes:
-        host: address to listen on. Only this machine can connect unless told otherwise.
-        port: gRPC port; 0 takes a free one.
-        admin_port: HTTP port of the admin surface; 0 takes a free one.
-        max_batch: most requests in one forward pass.
-        max_queue: most sessions that may wait; one more is answered RESOURCE_EXHAUSTED.
-        max_sessions: most sessions whose last answer is remembered; the least recently seen leaves.
-        session_ttl_s: seconds after which a silent session is forgotten and may count from 0 again.
-        default_deadline_s: deadline of a call that brought none, seconds.
-        max_request_bytes: largest InferRequest that is read, bytes. The default holds 512 float32
-            tokens of width 2176 (4.5 MB).
-        max_bytes_in_flight: most bytes that all open calls may hold together, as messages and as
-            decoded tokens; one more is answered RESOURCE_EXHAUSTED.
-        max_concurrent_calls: most calls open at once, health watchers included.
-        grace_s: seconds that calls in flight may still take when the server stops.
-        min_ping_interval_s: a client whose keepalive pings come faster than this loses its
-            connection. Clients of this project ping every 10 s.
+    Each is a flag of ``comvla-server serve``, an environment variable ``COMVLA_…`` and a key of a
+    TOML file as well. Those of the groups *model* and *logs* matter to the command line only: in
+    code an engine is made, and logging set up, by whoever makes the server.
+
+    Raises:
+        SettingsError: a value out of its range, or values that contradict one another.
     """
 
-    host: str = "127.0.0.1"
-    port: int = 0
-    admin_port: int = 0
-    max_batch: int = 8
-    max_queue: int = 64
-    max_sessions: int = 1024
-    session_ttl_s: float = 600.0
-    default_deadline_s: float = 5.0
-    max_request_bytes: int = 8 * 2**20
-    max_bytes_in_flight: int = 512 * 2**20
-    max_concurrent_calls: int = 1024
-    grace_s: float = 10.0
-    min_ping_interval_s: float = 5.0
+    model: str = setting(
+        "mini",
+        "checkpoint folder, hub repository, or mini, the shipped policy",
+        MODEL,
+        metavar="SOURCE",
+    )
+    device: str = setting("cpu", "torch device, e.g. cuda:0", MODEL)
+    dtype: str = setting(
+        "float32",
+        "number format of the weights",
+        MODEL,
+        choices=("float32", "bfloat16", "float16"),
+    )
+    threads: int | None = setting(
+        None, "CPU threads of the model; torch decides where not given", MODEL, low=1, high=4096
+    )
+    statistics_key: str | None = setting(
+        None,
+        "data set whose statistics apply, where the checkpoint holds several",
+        MODEL,
+        metavar="KEY",
+    )
+    fastv: tuple[int, float] | None = setting(
+        None,
+        "drop this share of the visual tokens before this layer, e.g. 3,0.75: saves operations, not bytes",
+        MODEL,
+        metavar="LAYER,DROP",
+        parse=_fastv,
+    )
+    compact_positions: bool = setting(
+        False, "number the tokens that arrive 0, 1, 2, …, as VLA-ADP does", MODEL
+    )
+    compile: bool = setting(False, "run the backbone through torch.compile", MODEL)
+
+    host: str = setting("127.0.0.1", "address to listen on; 0.0.0.0 for all", NETWORK)
+    port: int = setting(
+        0,
+        "gRPC port, 0 for a free one",
+        NETWORK,
+        high=65535,
+        hint="0 takes a free port",
+        serve_default=50051,
+    )
+    admin_host: str | None = setting(
+        None, "address of the admin surface; that of --host where not given", NETWORK
+    )
+    admin_port: int = setting(
+        0,
+        "HTTP port of /metrics, /readyz and /docs, 0 for a free one",
+        NETWORK,
+        metavar="PORT",
+        high=65535,
+        hint="0 takes a free port",
+        serve_default=8080,
+    )
+    insecure: bool = setting(
+        False,
+        "listen beyond this machine without TLS: whoever is on the way reads and alters everything",
+        NETWORK,
+    )
+
+    tls_certificate: Path | None = setting(
+        None, "certificate chain of this server, PEM; turns on TLS on both ports", TLS, path=True
+    )
+    tls_key: Path | None = setting(None, "its private key, PEM, not encrypted", TLS, path=True)
+    tls_client_ca: Path | None = setting(
+        None,
+        "authorities whose certificates robots must show, PEM; turns on mutual TLS on the gRPC port",
+        TLS,
+        path=True,
+    )
+
+    tokens_file: Path | None = setting(
+        None, "robots' hashed tokens: see comvla-server token", ACCESS, path=True
+    )
+    admin_tokens_file: Path | None = setting(
+        None, "hashed tokens of operators and Prometheus, for the admin surface", ACCESS, path=True
+    )
+    open_metrics: bool = setting(False, "let /metrics be read without a token", ACCESS)
+    identity_requests_per_s: float = setting(
+        0.0, "calls that one robot may make, 0 for no limit", ACCESS, unit="calls per second"
+    )
+    identity_bytes_per_s: float = setting(
+        0.0, "bytes that one robot may send, 0 for no limit", ACCESS, unit="bytes per second"
+    )
+    identity_max_calls: int = setting(
+        64, "calls that one robot may have open at once", ACCESS, low=1, high=1_000_000
+    )
+    reload_interval_s: float = setting(
+        2.0, "how often certificates and tokens are looked at for changes", ACCESS, above_zero=True
+    )
+
+    max_batch: int = setting(
+        8,
+        "most requests in one forward pass; 1 turns batching off",
+        LIMITS,
+        low=1,
+        high=1024,
+        hint="1 turns batching off",
+    )
+    max_queue: int = setting(
+        64,
+        "most robots that may wait; one more is answered RESOURCE_EXHAUSTED",
+        LIMITS,
+        low=1,
+        high=100_000,
+        hint="64 suits some tens of robots",
+    )
+    max_sessions: int = setting(
+        1024, "most sessions whose last answer is kept for a retry", LIMITS, high=10_000_000
+    )
+    session_ttl_s: float = setting(
+        600.0,
+        "silence after which a session is forgotten and may count from 0 again",
+        LIMITS,
+        above_zero=True,
+    )
+    max_request_bytes: int = setting(
+        8 * 2**20,
+        "largest request, bytes",
+        LIMITS,
+        low=1024,
+        high=2**30,
+        hint="8388608 holds 512 float32 tokens of 2176",
+    )
+    max_bytes_in_flight: int = setting(
+        512 * 2**20,
+        "most bytes that all open calls may hold together, as messages and as decoded tokens",
+        LIMITS,
+        high=2**40,
+        hint="it holds one request and its tokens",
+    )
+    max_concurrent_calls: int = setting(
+        1024,
+        "most calls open at once, health watchers included",
+        LIMITS,
+        low=1,
+        high=1_000_000,
+        hint="1024 suits most",
+    )
+    default_deadline_s: float = setting(
+        5.0, "deadline of calls that bring none", LIMITS, above_zero=True
+    )
+    grace_s: float = setting(10.0, "time that calls in flight get when the server stops", LIMITS)
+
+    max_connections: int = setting(
+        1024,
+        "most connections to the gRPC port; one more is closed at once",
+        CONNECTIONS,
+        low=1,
+        high=1_000_000,
+    )
+    max_calls_per_connection: int = setting(
+        1024, "most calls open on one connection; more wait at the client", CONNECTIONS, low=1
+    )
+    max_metadata_bytes: int = setting(
+        16 * 1024,
+        "largest header of a call, bytes",
+        CONNECTIONS,
+        low=4096,
+        high=2**20,
+        hint="16384 holds every header of this project many times",
+    )
+    handshake_timeout_s: float = setting(
+        10.0, "time to finish TLS and HTTP/2 handshakes", CONNECTIONS, above_zero=True
+    )
+    request_timeout_s: float = setting(
+        10.0, "time in which a request must arrive whole", CONNECTIONS, above_zero=True
+    )
+    connection_idle_s: float = setting(
+        600.0, "after so long without a call a connection is closed", CONNECTIONS, above_zero=True
+    )
+    connection_age_s: float = setting(
+        3600.0,
+        "after so long a robot has to connect anew, with the certificates of then",
+        CONNECTIONS,
+        above_zero=True,
+    )
+    min_ping_interval_s: float = setting(
+        5.0,
+        "a client whose keepalive pings come faster loses its connection; robots ping every 10 s",
+        CONNECTIONS,
+        above_zero=True,
+    )
+
+    log_format: str = setting("plain", "of each line", LOGS, choices=("plain", "json"))
+    log_level: str = setting(
+        "info",
+        "lowest level shown",
+        LOGS,
+        choices=("debug", "info", "warning", "error"),
+    )
 
     def __post_init__(self) -> None:
-        """Refuses what cannot work.
+        """Refuses what cannot work."""
+        fields = fields_of(type(self))
+        for name, field in fields.items():
+            value = getattr(self, name)
+            if field.declared.path and isinstance(value, str):
+                value = Path(value)
+                object.__setattr__(self, name, value)
+            check_value(field, value)
+        check_together(self)
 
-        Raises:
-            SettingsError: a value out of its range.
-        """
-        if not self.host or any(c.isspace() or not c.isprintable() for c in self.host):
-            raise SettingsError(
-                f"host must be an address such as 127.0.0.1 or ::1, got {self.host!r}"
-            )
-        for name in ("port", "admin_port"):
-            self._whole(name, 0, 65535, "0 takes a free port")
-        if self.port and self.port == self.admin_port:
-            raise SettingsError(
-                f"port and admin_port are both {self.port}: gRPC and HTTP need one each"
-            )
-        self._whole("max_batch", 1, 1024, "1 turns batching off")
-        self._whole("max_queue", 1, 100_000, "64 suits some tens of robots")
-        least = self.max_queue + self.max_batch
-        self._whole("max_sessions", least, 10_000_000, "it covers max_queue + max_batch")
-        self._whole("max_request_bytes", 1024, 2**30, "8388608 holds 512 float32 tokens of 2176")
-        least = 2 * self.max_request_bytes
-        self._whole("max_bytes_in_flight", least, 2**40, "it holds one request and its tokens")
-        self._whole("max_concurrent_calls", 1, 1_000_000, "1024 suits most")
-        for name in ("session_ttl_s", "default_deadline_s", "min_ping_interval_s"):
-            self._seconds(name, zero=False)
-        self._seconds("grace_s", zero=True)
+    @property
+    def tls(self) -> bool:
+        """Whether both ports are encrypted."""
+        return self.tls_certificate is not None
 
-    def _whole(self, name: str, low: int, high: int, hint: str) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-            raise SettingsError(
-                f"{name} must be a whole number from {low} to {high}, got {value!r}: {hint}"
-            )
+    @property
+    def authenticates(self) -> bool:
+        """Whether every robot has to say, and prove, who it is."""
+        return self.tokens_file is not None or self.tls_client_ca is not None
 
-    def _seconds(self, name: str, zero: bool) -> None:
-        value = getattr(self, name)
-        if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
-            least = "at least 0" if zero else "above 0"
-            raise SettingsError(f"{name} must be a finite number of seconds {least}, got {value!r}")
+    @property
+    def admin_address(self) -> str:
+        """Where the admin surface listens."""
+        return self.host if self.admin_host is None else self.admin_host

@@ -251,6 +251,8 @@ FALLBACKS = {
     "DEADLINE_EXCEEDED": "deadline",
     "RESOURCE_EXHAUSTED": "overloaded",
     "ABORTED": "rejected",
+    "UNAUTHENTICATED": "unauthorized",
+    "PERMISSION_DENIED": "unauthorized",
     "INTERNAL": "rejected",
     "UNKNOWN": "rejected",
 }
@@ -322,7 +324,6 @@ def test_a_robot_that_restarts_is_not_taken_for_its_former_self() -> None:
         ("INVALID_ARGUMENT", "something newer", HandshakeError),
         ("FAILED_PRECONDITION", "server runs other with fingerprint 'x'", HandshakeError),
         ("UNIMPLEMENTED", "no such method", HandshakeError),
-        ("UNAUTHENTICATED", "who are you", HandshakeError),
         ("RESOURCE_EXHAUSTED", "Received message larger than max (9 vs. 4)", HandshakeError),
         ("RESOURCE_EXHAUSTED", "expected a request of at most 9 bytes, got 10", HandshakeError),
     ],

@@ -9,13 +9,14 @@ from xml.etree import ElementTree
 import markdown
 import pytest
 
-import comvla_server.cli
 from comvla.codec import payload_bytes
 from comvla_client import LinkProfile, token_budget
 from comvla_client.report import StepReport
 from comvla_client.selection import SELECTORS
 from comvla_server.metrics import Metrics
 from comvla_server.service import STATUS
+from comvla_server.setting_fields import fields_of
+from comvla_server.settings import ServerSettings
 
 README = markdown.ROOT / "README.md"
 SERVER = markdown.ROOT / "docs" / "server.md"
@@ -61,10 +62,12 @@ def test_the_server_guide_names_every_metric_with_its_type() -> None:
 
 
 def test_the_server_guide_states_the_limits_that_are_in_force() -> None:
-    defaults = vars(comvla_server.cli.build_parser().parse_args(["serve"]))
-    for option, default, _ in markdown.table(SERVER, "option"):
-        name = option.strip("`").removeprefix("--").replace("-", "_")
-        assert float(default) == defaults[name], option
+    fields = {field.flag: field for field in fields_of(ServerSettings).values()}
+    stated = {row[0].strip("`"): float(row[1]) for row in markdown.table(SERVER, "option")}
+    assert stated == {flag: fields[flag].serve_default for flag in stated}
+    numbers = {flag for flag, field in fields.items() if field.kind in (int, float)}
+    elsewhere = {"--port", "--admin-port", "--reload-interval-s", "--session-ttl-s"}
+    assert set(stated) == numbers - elsewhere
 
 
 def test_the_server_guide_explains_every_status_that_a_robot_can_see() -> None:

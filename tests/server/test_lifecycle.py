@@ -187,7 +187,7 @@ def test_two_servers_never_share_a_port(cloud: StubCloud) -> None:
 
 def test_an_address_of_another_machine_is_refused(cloud: StubCloud) -> None:
     with pytest.raises(BindError, match=r"192\.0\.2\.1"):
-        BackgroundServer(Engine(cloud), ServerSettings(host="192.0.2.1")).start()
+        BackgroundServer(Engine(cloud), ServerSettings(host="192.0.2.1", insecure=True)).start()
 
 
 def test_a_model_that_cannot_be_loaded_ends_the_start() -> None:
@@ -209,9 +209,10 @@ def test_a_message_cap_below_an_unpruned_observation_is_refused(cloud: StubCloud
 def test_listening_beyond_this_machine_is_warned_about(
     cloud: StubCloud, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with BackgroundServer(Engine(cloud), ServerSettings(host="0.0.0.0")):
+    with BackgroundServer(Engine(cloud), ServerSettings(host="0.0.0.0", insecure=True)):
         pass
-    assert "without authentication" in caplog.text
+    for words in ("without authentication", "without encryption", "admin surface on 0.0.0.0"):
+        assert words in caplog.text
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])

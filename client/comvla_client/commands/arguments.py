@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TypeAlias
 
 from comvla import codec
 from comvla.errors import DependencyError
+from comvla_client.access import Access, TlsOptions
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.edge import EdgeModel
 
@@ -22,6 +24,55 @@ def add_target(parser: argparse.ArgumentParser) -> None:
         default=5.0,
         metavar="S",
         help="seconds to wait for the server (default: %(default)s)",
+    )
+    group = parser.add_argument_group("encryption and identity")
+    group.add_argument("--tls", action="store_true", help="use TLS with the system's authorities")
+    group.add_argument(
+        "--tls-ca", metavar="FILE", help="authorities that may vouch for the server, PEM; uses TLS"
+    )
+    group.add_argument(
+        "--tls-certificate", metavar="FILE", help="this robot's certificate, PEM, for mutual TLS"
+    )
+    group.add_argument("--tls-key", metavar="FILE", help="its private key, PEM")
+    group.add_argument(
+        "--tls-server-name", metavar="NAME", help="name in the server's certificate, if another"
+    )
+    group.add_argument(
+        "--token-file", type=Path, metavar="FILE", help="file that holds this robot's token"
+    )
+    group.add_argument(
+        "--insecure",
+        action="store_true",
+        help="send the token in the clear, where only this robot and the server can listen",
+    )
+
+
+def tls_of(arguments: argparse.Namespace) -> TlsOptions | None:
+    """The TLS options that the arguments describe, None for none.
+
+    Raises:
+        AccessError: half a pair.
+    """
+    given = {
+        "ca": arguments.tls_ca,
+        "certificate": arguments.tls_certificate,
+        "key": arguments.tls_key,
+        "server_name": arguments.tls_server_name,
+    }
+    if arguments.tls or any(value is not None for value in given.values()):
+        return TlsOptions(**given)
+    return None
+
+
+def access_of(arguments: argparse.Namespace) -> Access:
+    """How the arguments say to reach the server.
+
+    Raises:
+        HandshakeError: the target is no address.
+        AccessError: certificates or a token that cannot be used.
+    """
+    return Access(
+        arguments.target, tls_of(arguments), arguments.token_file, insecure=arguments.insecure
     )
 
 

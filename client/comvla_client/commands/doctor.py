@@ -19,9 +19,18 @@ from comvla.errors import ComVLAError
 from comvla.model_info import ModelInfo
 from comvla_client import channel
 from comvla_client.budget import framed_token_budget, token_budget
-from comvla_client.commands.arguments import Subparsers, add_link, add_target, link_of, load_edge
+from comvla_client.commands.arguments import (
+    Subparsers,
+    access_of,
+    add_link,
+    add_target,
+    link_of,
+    load_edge,
+    tls_of,
+)
 from comvla_client.errors import TransportError
 from comvla_client.health import check_health
+from comvla_client.locked_out import locked_out
 from comvla_client.transport import GrpcTransport
 
 USEFUL_TOKENS = 20
@@ -94,14 +103,22 @@ def examine(arguments: argparse.Namespace) -> Iterator[Finding]:
     Raises:
         LinkError: link arguments out of range.
         HandshakeError: the target is no address.
+        AccessError: certificates or a token that cannot be used.
     """
-    link_of(arguments)  # a mistyped link is an error of the command, not a finding
+    # A mistyped link or an unreadable file is an error of the command, not a finding.
+    link_of(arguments)
+    access_of(arguments)
     yield _torch()
     reach = _reach(channel.check_target(arguments.target), arguments.connect_timeout_s)
     yield reach
     if not reach.ok:
         return
-    transport = GrpcTransport(arguments.target)
+    transport = GrpcTransport(
+        arguments.target,
+        tls_of(arguments),
+        arguments.token_file,
+        insecure=arguments.insecure,
+    )
     try:
         try:
             response = transport.get_model(arguments.connect_timeout_s)
@@ -144,13 +161,20 @@ def _reach(target: str, timeout_s: float) -> Finding:
             False,
             f"no TCP connection to {target} within {timeout_s:g} s: {error}",
             "start `comvla-server serve` there, listening on an address that this robot reaches "
-            "(--host 0.0.0.0 opens it to the network); check the port, the route and the firewall",
+            "(--host 0.0.0.0 with TLS opens it to the network); check the port, the route and the firewall",
         )
     elapsed_s = time.perf_counter() - began
     return Finding("reach", True, f"TCP connects in {1e3 * elapsed_s:.1f} ms")
 
 
 def _no_handshake(arguments: argparse.Namespace, error: ComVLAError) -> Finding:
+    if isinstance(error, TransportError) and locked_out(error) is not None:
+        return Finding(
+            "access",
+            False,
+            f"{error.code}: {error.message}",
+            f"a server is there, but {locked_out(error)}",
+        )
     if isinstance(error, TransportError):
         error = channel.no_server(arguments.target, error, arguments.connect_timeout_s)
     return Finding(
@@ -171,7 +195,7 @@ def _edge(source: str, cloud: ModelInfo) -> Finding:
 
 def _health(arguments: argparse.Namespace) -> Finding:
     try:
-        status = check_health(arguments.target, arguments.connect_timeout_s)
+        status = check_health(access_of(arguments), arguments.connect_timeout_s)
     except TransportError as error:
         return Finding(
             "health",

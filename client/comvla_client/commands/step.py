@@ -13,7 +13,14 @@ import numpy.typing as npt
 from comvla.errors import DependencyError, ObservationError
 from comvla.model_info import ModelInfo
 from comvla_client.client import ComVLAClient
-from comvla_client.commands.arguments import Subparsers, add_link, add_target, link_of, load_edge
+from comvla_client.commands.arguments import (
+    Subparsers,
+    add_link,
+    add_target,
+    link_of,
+    load_edge,
+    tls_of,
+)
 from comvla_client.report import ActionChunk
 from comvla_client.selection import SELECTORS
 from comvla_client.sending import POLICIES
@@ -97,6 +104,9 @@ def run(arguments: argparse.Namespace) -> int:
         sending=arguments.sending,
         deadline_s=arguments.deadline_s,
         connect_timeout_s=arguments.connect_timeout_s,
+        tls=tls_of(arguments),
+        token=arguments.token_file,
+        insecure=arguments.insecure,
         seed=arguments.seed,
     ) as client:
         chunk = client.step(obs, arguments.instruction, arguments.snr_db)

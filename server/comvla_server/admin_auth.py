@@ -1,0 +1,66 @@
+"""The admin surface behind a token of its own."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from comvla_server.auth import bearer_token
+from comvla_server.tokens import TokenFile
+
+# Probes carry no token, and learn no more than up or down.
+_OPEN = frozenset({"/healthz", "/readyz"})
+
+_REFUSED = b"expected a token of the admin tokens file: `comvla-server token new` makes one\n"
+
+Asgi = Callable[[Any, Any, Any], Awaitable[None]]
+
+
+class AdminAuth:
+    """ASGI middleware that lets nobody past without a token, except to the probes.
+
+    Programs send ``Authorization: Bearer TOKEN``. Browsers ask for a name and a password: the name
+    is any, the password is the token.
+
+    Args:
+        app: what is behind it.
+        tokens: known tokens.
+        open_metrics: whether ``/metrics`` may be read without one.
+    """
+
+    def __init__(self, app: Asgi, tokens: TokenFile, open_metrics: bool) -> None:
+        self._app = app
+        self._tokens = tokens
+        self._open = _OPEN | {"/metrics"} if open_metrics else _OPEN
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Passes on, or answers 401."""
+        if scope["type"] == "lifespan" or scope.get("path") in self._open or self._known(scope):
+            await self._app(scope, receive, send)
+            return
+        headers = [
+            (b"content-type", b"text/plain"),
+            (b"content-length", str(len(_REFUSED)).encode()),
+            (b"www-authenticate", b'Basic realm="comvla", charset="UTF-8"'),
+            (b"cache-control", b"no-store"),
+        ]
+        await send({"type": "http.response.start", "status": 401, "headers": headers})
+        await send({"type": "http.response.body", "body": _REFUSED})
+
+    def _known(self, scope: Any) -> bool:
+        given = [value for name, value in scope["headers"] if name == b"authorization"]
+        token = _token(given[0]) if len(given) == 1 else None
+        return token is not None and self._tokens.find(token) is not None
+
+
+def _token(value: bytes) -> str | None:
+    scheme, _, rest = value.strip().partition(b" ")
+    if scheme.lower() != b"basic":
+        return bearer_token(value)
+    try:
+        _, _, password = base64.b64decode(rest.strip(), validate=True).partition(b":")
+    except binascii.Error:
+        return None
+    return password.decode("latin-1") or None
