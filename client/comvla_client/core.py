@@ -204,6 +204,7 @@ class ClientCore:
                 suggested_tokens=response.load.suggested_tokens,
             ),
         )
+        self._tell_source(report)
         return ActionChunk(actions=actions, planned=len(actions), report=report)
 
     def fail(
@@ -228,6 +229,7 @@ class ClientCore:
         )
         if call_s == 0.0:  # no call was made, so nothing crossed the link
             report = replace(report, tokens=0, payload_bytes=0, encoded_bytes=0, framed_bytes=0)
+        self._tell_source(report)
         return ActionChunk(actions=actions, planned=planned, report=report)
 
     def too_late(self, prepared: Prepared) -> TransportError:
@@ -252,6 +254,12 @@ class ClientCore:
         if snr is not None:
             return as_reading(snr)
         return None if self._snr is None else self._snr.read()
+
+    def _tell_source(self, report: StepReport) -> None:
+        """Sources that learn from how steps end have ``observe``."""
+        observe = getattr(self._snr, "observe", None)
+        if observe is not None:
+            observe(report)
 
     def _blank_request(
         self, instruction: str, proprio: list[float], reading: SnrReading | None

@@ -14,6 +14,7 @@ from comvla.errors import DependencyError, ObservationError
 from comvla.model_info import ModelInfo
 from comvla_client.client import ComVLAClient
 from comvla_client.commands.arguments import Subparsers, add_link, add_target, link_of, load_edge
+from comvla_client.commands.snr_arguments import add_snr_source, opened
 from comvla_client.report import ActionChunk
 from comvla_client.selection import SELECTORS
 
@@ -73,6 +74,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of the synthetic observation")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_link(parser)
+    add_snr_source(parser)
     return parser
 
 
@@ -80,18 +82,22 @@ def run(arguments: argparse.Namespace) -> int:
     """Sends the observation. 0 when the cloud answered, 1 when the robot had to fall back."""
     edge = load_edge(arguments.edge)
     obs = _observation(arguments, edge.info)
-    with ComVLAClient(
-        arguments.target,
-        edge=edge,
-        link=link_of(arguments),
-        quantization=arguments.quantization,
-        selector=arguments.selector,
-        budget="paper" if arguments.tokens is None else arguments.tokens,
-        deadline_s=arguments.deadline_s,
-        connect_timeout_s=arguments.connect_timeout_s,
-        seed=arguments.seed,
-    ) as client:
-        chunk = client.step(obs, arguments.instruction, arguments.snr_db)
+    with (
+        opened(arguments.snr_source, arguments.snr_db) as snr,
+        ComVLAClient(
+            arguments.target,
+            edge=edge,
+            link=link_of(arguments),
+            quantization=arguments.quantization,
+            selector=arguments.selector,
+            budget="paper" if arguments.tokens is None else arguments.tokens,
+            deadline_s=arguments.deadline_s,
+            connect_timeout_s=arguments.connect_timeout_s,
+            seed=arguments.seed,
+            snr=snr,
+        ) as client,
+    ):
+        chunk = client.step(obs, arguments.instruction)
     if arguments.json:
         print(json.dumps({"actions": chunk.actions.tolist(), "report": chunk.report.to_dict()}))
     else:
