@@ -51,8 +51,9 @@ def evidence_of(
     * All tokens arrived: the framed bytes crossed in the time of the call, less the server's own
       share and an empty round trip.
     * Some arrived: the link carried those in one period, and no more.
-    * No answer in time: the link was slower than the bytes that were sent over the time of waiting
-      (or the server was: a single failure is therefore taken with reserve).
+    * No answer in time: the link was slower than the bytes that were sent over the time of waiting,
+      which is a period at least; in a simulated link it passes at once. (Or the server was slow: a
+      single failure is therefore taken with reserve.)
 
     Args:
         report: of the step.
@@ -68,7 +69,7 @@ def evidence_of(
     if report.source != "cloud":
         if report.fallback_reason != "deadline":
             return None
-        waited_s = max(waited_s, SHORTEST_TRANSFER_S)
+        waited_s = max(waited_s, link.period_s)
         return Evidence(equivalent_snr_db(report.framed_bytes, waited_s, link), bound=True)
     if 0 < report.tokens_used < report.tokens:
         lost_bytes = report.encoded_bytes * (1.0 - report.tokens_used / report.tokens)

@@ -1,10 +1,15 @@
-"""A Kalman filter for the SNR of a fading link, in dB: a level that drifts, and fading around it.
+"""A Kalman filter for the SNR of a fading link, in dB.
 
-    x(t) = m(t) + f(t),   m: random walk, d Var = q dt,   f: mean 0, Cov(f(t), f(t + a)) = σ² exp(−a / τ)
+Three things are unknown, and each forgets at its own pace (Ornstein-Uhlenbeck processes: mean 0 or
+a first guess, stationary deviation σ, covariance σ² exp(−a / τ) over a time a):
 
-The level m is what distance and shadowing make of the link; f is multipath fading, which nobody can
-predict for longer than the coherence time τ. What was measured long ago therefore still tells the
-level, and nothing about the fading.
+* the **level** that distance and shadowing make of the link: seconds to minutes;
+* **fading** around it, which nobody can predict for longer than the coherence time;
+* the **bias** of what a modem reports: it hears the downlink, and has its own idea of noise.
+
+The uplink's SNR is level + fading. Goodput measures that sum; a report measures level + bias and as
+much of the fading as its age has left. So a biased modem is found out by what arrives, and old
+measurements still tell the level.
 """
 
 from __future__ import annotations
@@ -12,10 +17,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 RAYLEIGH_STD_DB = 5.57
 """Standard deviation of Rayleigh fading in dB: that of 10 log10 of an exponential variable."""
-
-_WIDEST_VARIANCE = 900.0  # (30 dB)²: what is known of a link of which nothing was measured for long
 
 
 @dataclass(frozen=True)
@@ -29,14 +34,6 @@ class Gaussian:
 
     mean: float
     variance: float
-
-    def times(self, other: Gaussian) -> Gaussian:
-        """The normalised product: what two independent opinions say together (Bayes)."""
-        share = other.variance / (self.variance + other.variance)  # of this one
-        mean = share * self.mean + (1.0 - share) * other.mean
-        # Rounding must not carry the mean out of the interval between the two.
-        low, high = sorted((self.mean, other.mean))
-        return Gaussian(min(max(mean, low), high), share * self.variance)
 
     def below(self, bound: float) -> Gaussian:
         """Moments of this distribution cut off above ``bound`` (at most 2 deviations below its mean).
@@ -53,7 +50,7 @@ class Gaussian:
         )
 
     def over(self, other: Gaussian) -> Gaussian | None:
-        """What ``other`` must be multiplied with to give this; None where that says nothing."""
+        """The measurement that turns ``other`` into this; None where it would say nothing."""
         precision = 1.0 / self.variance - 1.0 / other.variance
         if precision <= 1e-9:
             return None
@@ -61,71 +58,80 @@ class Gaussian:
         return Gaussian(mean, 1.0 / precision)
 
 
-class FadingFilter:
-    """Knows the link from noisy measurements of its SNR.
+@dataclass(frozen=True)
+class Process:
+    """How one of the unknowns moves.
 
-    Args:
-        coherence_s: τ, seconds after which fading has changed.
-        fading_std_db: σ, its deviation in dB.
-        drift_db: what the level moves in a second, as a deviation in dB.
+    Attributes:
+        std_db: its stationary deviation, in dB.
+        memory_s: τ, seconds in which it forgets.
     """
 
-    def __init__(self, coherence_s: float, fading_std_db: float, drift_db: float) -> None:
-        self._coherence_s = coherence_s
-        self._fading_variance = fading_std_db**2
-        self._drift_variance = drift_db**2
-        self._time_s: float | None = None
-        self._level = self._fading = 0.0
-        # Variances of level and fading, and their covariance.
-        self._level_variance = self._fading_variance_now = self._covariance = 0.0
-        self._lowest, self._highest = math.inf, -math.inf
+    std_db: float
+    memory_s: float
 
-    def at(self, time_s: float) -> Gaussian | None:
-        """What is known of the SNR at a time; None where nothing was ever measured."""
-        if self._time_s is None:
-            return None
+
+class LinkFilter:
+    """Knows the link from measurements of its rate and reports of its SNR.
+
+    Args:
+        level_db: first guess of the level, to which it returns when nothing is heard for long.
+        level: how the level moves.
+        fading: how fading moves; its memory is the coherence time.
+        bias: how the bias of reports moves.
+        time_s: now, on a clock of the caller's; later calls must not go back.
+    """
+
+    def __init__(
+        self, level_db: float, level: Process, fading: Process, bias: Process, time_s: float
+    ) -> None:
+        processes = (level, fading, bias)
+        self._memory_s = np.array([process.memory_s for process in processes])
+        self._stationary = np.diag([process.std_db**2 for process in processes])
+        self._fading = fading
+        self._rest = np.array([level_db, 0.0, 0.0])
+        self._state = self._rest.copy()  # level, fading, bias
+        self._covariance = self._stationary.copy()
+        self._time_s = time_s
+        self._lowest = self._highest = level_db
+
+    def at(self, time_s: float) -> Gaussian:
+        """What is known of the uplink's SNR at a time."""
         self._go_to(time_s)
-        return Gaussian(self._clipped(self._level + self._fading), self._variance())
+        sees = np.array([1.0, 1.0, 0.0])
+        mean = float(sees @ self._state)
+        # The sum of a bias that was learned and a report that jumps may leave all that was ever
+        # heard; a budget should not.
+        mean = min(max(mean, self._lowest), self._highest)
+        return Gaussian(mean, max(float(sees @ self._covariance @ sees), 1e-6))
 
     def measure(self, measured: Gaussian, time_s: float) -> None:
-        """Takes in a measurement, with its own noise as variance."""
+        """Takes in the uplink's SNR as it was just seen; the variance is the measurement's own."""
+        self._go_to(time_s)
+        self._update(np.array([1.0, 1.0, 0.0]), measured)
+
+    def report(self, reported: Gaussian, age_s: float, time_s: float) -> None:
+        """Takes in what a modem says; the variance is its noise from one report to the next."""
+        self._go_to(time_s)
+        kept = math.exp(-age_s / self._fading.memory_s)
+        other_fading = (1.0 - kept**2) * self._fading.std_db**2
+        noisy = Gaussian(reported.mean, reported.variance + other_fading)
+        self._update(np.array([1.0, kept, 1.0]), noisy)
+
+    def _update(self, sees: np.ndarray, measured: Gaussian) -> None:
         self._lowest = min(self._lowest, measured.mean)
         self._highest = max(self._highest, measured.mean)
-        if self._time_s is None:
-            # Of the level nothing was known, so it takes all: m = y − f − noise.
-            self._time_s = time_s
-            self._level, self._fading = measured.mean, 0.0
-            self._level_variance = self._fading_variance + measured.variance
-            self._fading_variance_now = self._fading_variance
-            self._covariance = -self._fading_variance
-            return
-        self._go_to(time_s)
-        innovation = measured.mean - self._level - self._fading
-        to_level = self._level_variance + self._covariance
-        to_fading = self._fading_variance_now + self._covariance
-        total = self._variance() + measured.variance
-        self._level += to_level / total * innovation
-        self._fading += to_fading / total * innovation
-        self._level_variance -= to_level**2 / total
-        self._fading_variance_now -= to_fading**2 / total
-        self._covariance -= to_level * to_fading / total
+        spread = self._covariance @ sees
+        gain = spread / (sees @ spread + measured.variance)
+        self._state = self._state + gain * (measured.mean - sees @ self._state)
+        covariance = self._covariance - np.outer(gain, spread)
+        self._covariance = (covariance + covariance.T) / 2.0
 
     def _go_to(self, time_s: float) -> None:
-        assert self._time_s is not None
         elapsed_s = max(0.0, time_s - self._time_s)
         self._time_s += elapsed_s
-        kept = math.exp(-elapsed_s / self._coherence_s)
-        self._fading *= kept
-        self._covariance *= kept
-        self._fading_variance_now = (
-            kept**2 * self._fading_variance_now + (1.0 - kept**2) * self._fading_variance
+        kept = np.exp(-elapsed_s / self._memory_s)
+        self._state = self._rest + kept * (self._state - self._rest)
+        self._covariance = self._stationary + np.outer(kept, kept) * (
+            self._covariance - self._stationary
         )
-        drifted = self._level_variance + self._drift_variance * elapsed_s
-        self._level_variance = max(self._level_variance, min(drifted, _WIDEST_VARIANCE))
-
-    def _variance(self) -> float:
-        variance = self._level_variance + self._fading_variance_now + 2.0 * self._covariance
-        return max(variance, 1e-6)
-
-    def _clipped(self, snr_db: float) -> float:
-        return min(max(snr_db, self._lowest), self._highest)

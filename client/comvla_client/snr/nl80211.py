@@ -150,25 +150,27 @@ class Nl80211:
 
     def interfaces(self) -> list[Interface]:
         """All wireless interfaces of this network namespace."""
-        return interfaces_in(self._socket.get_interfaces_dump())
+        return interfaces_in(list(self._socket.get_interfaces_dump()))
 
     def station(self, interface: Interface) -> Station | None:
         """Who is at the other end; None while the interface is not associated."""
-        return station_in(self._socket.get_stations(interface.index))
+        return station_in(list(self._socket.get_stations(interface.index)))
 
     def noise_dbm(self, interface: Interface) -> float | None:
         """Noise in the channel in use; None where the driver does not measure it."""
-        return noise_in(self._socket.survey(interface.index))
+        return noise_in(list(self._socket.survey(interface.index)))
 
     def power_save(self, interface: Interface) -> bool | None:
         """Whether the card sleeps between beacons; None where the driver does not say."""
+        from pyroute2.netlink import NLM_F_ACK, NLM_F_REQUEST
         from pyroute2.netlink.nl80211 import NL80211_NAMES, nl80211cmd
 
         message = nl80211cmd()
         message["cmd"] = NL80211_NAMES["NL80211_CMD_GET_POWER_SAVE"]
         message["attrs"] = [["NL80211_ATTR_IFINDEX", interface.index]]
-        answers = self._socket.nlm_request(message, msg_type=self._socket.prid, msg_flags=1)
-        return power_save_in(answers)
+        flags = NLM_F_REQUEST | NLM_F_ACK
+        answers = self._socket.nlm_request(message, msg_type=self._socket.prid, msg_flags=flags)
+        return power_save_in(list(answers))
 
     def close(self) -> None:
         """Closes the socket."""
