@@ -22,7 +22,7 @@ def bus(folder: Path) -> Iterator[str]:
     """A message bus; gives its address."""
     program = shutil.which("dbus-daemon")
     if program is None:
-        pytest.skip("needs dbus-daemon: apt-get install dbus")
+        pytest.skip("needs dbus-daemon: apt-get install dbus-daemon")
     address = f"unix:path={folder}/bus"
     daemon = subprocess.Popen(
         [

@@ -64,7 +64,11 @@ class Relay:
         await asyncio.gather(*others, return_exceptions=True)
 
     async def _connected(self, near: asyncio.StreamReader, back: asyncio.StreamWriter) -> None:
-        far, up = await asyncio.open_connection(*self._server)
+        try:
+            far, up = await asyncio.open_connection(*self._server)
+        except OSError:
+            back.close()
+            return
         uplink: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
         downlink: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
         ways = [

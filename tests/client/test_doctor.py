@@ -166,7 +166,7 @@ def test_a_link_that_sleeps_is_found(
         findings = examined(capsys, target, "--seconds", "8", "--calls", "3")
     assert findings["idle"]["status"] == "fail"
     assert findings["idle"]["values"]["penalty_s"] > 0.1
-    assert "tcp_slow_start_after_idle=0" in findings["idle"]["remedy"]
+    assert "tcp_slow_start_after_idle" in findings["idle"]["remedy"]
 
 
 def test_a_connection_that_is_forgotten_is_found(

@@ -83,8 +83,9 @@ def idle_restart(
         "idle",
         "fail",
         found,
-        "TCP starts slowly after a silence, and a robot that executes chunks is silent between "
-        "queries: sysctl -w net.ipv4.tcp_slow_start_after_idle=0 on this machine",
+        "a robot that executes chunks is silent between queries; TCP may start slowly after that "
+        "(tcp_slow_start_after_idle, below), or the radio fall asleep: Wi-Fi by power saving, a modem "
+        "within seconds (ask the operator for a longer inactivity timer)",
         values,
     ), True
 
