@@ -105,6 +105,15 @@ need_prometheus() {
         "sudo apt-get install prometheus"
 }
 
+# Another asks a made-up modem over a real message bus.
+need_dbus() {
+    if command -v dbus-daemon >/dev/null; then return; fi
+    # The daemon alone, without the system bus that the package "dbus" starts.
+    if may_install && apt_install dbus-daemon; then return; fi
+    say "the tests with a real D-Bus will be skipped; to run them type:" \
+        "sudo apt-get install dbus-daemon"
+}
+
 # ---- What was asked for ---------------------------------------------------------------------
 
 case $extra in
@@ -116,6 +125,7 @@ dev)
     install_package dev
     need_gl
     need_prometheus
+    need_dbus
     ;;
 proto)
     # Always here, because the test that regenerates the code looks for it here.

@@ -83,6 +83,24 @@ class LinkProfile:
         bits = _bits_in(self.efficiency, self.bandwidth_hz, self.period_s, self.reserve_s, periods)
         return bits * _log2_one_plus(check_snr_db(snr_db))
 
+    def snr_db(self, capacity_bits: float) -> float:
+        """The SNR in dB at which so many bits cross in one period: the inverse of Eq. (1).
+
+        Args:
+            capacity_bits: C_link, finite; 0 gives −inf.
+
+        Raises:
+            LinkError: negative or not finite.
+        """
+        if not _is_finite_number(capacity_bits) or capacity_bits < 0:
+            raise LinkError(f"expected capacity_bits >= 0 and finite, got {capacity_bits!r}")
+        if capacity_bits == 0:
+            return -math.inf
+        octaves = capacity_bits / (self.efficiency * self.bandwidth_hz * self.period_s)
+        if octaves > 100.0:  # 1 is nothing beside 2 ** 100
+            return octaves * 10.0 * math.log10(2.0)
+        return 10.0 * math.log10(math.expm1(octaves * math.log(2.0)))
+
 
 @functools.lru_cache(maxsize=64)
 def _bits_in(

@@ -7,13 +7,14 @@ import sys
 from collections.abc import Sequence
 
 from comvla.errors import ComVLAError
-from comvla_client.commands import doctor, step
+from comvla_client.commands import doctor, snr, step
 
 _DESCRIPTION = """\
 The robot's side of ComVLA: look at a link and a server, or send one observation through them.
 
   comvla doctor 127.0.0.1:50051             is a server there, how far away, what fits the link?
   comvla step 127.0.0.1:50051 --snr-db 10   one synthetic observation through the shipped policy
+  comvla snr wifi                           what this robot's radio reports, live
 
 A server is started with `comvla-server serve --model mini`.
 """
@@ -27,7 +28,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (doctor, step):
+    for command in (doctor, snr, step):
         command.add_parser(subparsers).set_defaults(run=command.run)
     return parser
 

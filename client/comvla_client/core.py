@@ -232,6 +232,7 @@ class ClientCore:
                 suggested_tokens=response.load.suggested_tokens,
             ),
         )
+        self._tell_source(report)
         return ActionChunk(actions=actions, planned=len(actions), report=report)
 
     def fail(
@@ -257,6 +258,7 @@ class ClientCore:
             fallback_reason=reason,
             detail=detail,
         )
+        self._tell_source(report)
         return ActionChunk(actions=actions, planned=planned, report=report)
 
     def too_late(self, prepared: Prepared) -> TransportError:
@@ -375,6 +377,12 @@ class ClientCore:
         if snr is not None:
             return as_reading(snr)
         return None if self._snr is None else self._snr.read()
+
+    def _tell_source(self, report: StepReport) -> None:
+        """Sources that learn from how steps end have ``observe``."""
+        observe = getattr(self._snr, "observe", None)
+        if observe is not None:
+            observe(report)
 
     def _blank_request(
         self, instruction: str, proprio: list[float], reading: SnrReading | None

@@ -7,6 +7,10 @@ class ClientClosedError(ComVLAError, RuntimeError):
     """The client or its transport was closed, perhaps by another thread while a step was under way."""
 
 
+class SnrSourceError(ComVLAError):
+    """A device or a bus that gives no SNR; the message says what to use instead."""
+
+
 class TransportError(ComVLAError):
     """A call got no usable answer. A step turns it into a fallback or, if nobody can wait it out, raises.
 

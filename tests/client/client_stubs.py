@@ -203,6 +203,8 @@ class StubService(policy_pb2_grpc.PolicyServiceServicer):
         self.requests.append(request)
         if self.before is not None:
             self.before(request, context)
+        if request.model_fingerprint != self.info.fingerprint:
+            context.abort(grpc.StatusCode.FAILED_PRECONDITION, "another model")
         return answer(request, self.info)
 
 

@@ -13,6 +13,7 @@ from comvla.codec import payload_bytes
 from comvla_client import LinkProfile, token_budget
 from comvla_client.report import StepReport
 from comvla_client.selection import SELECTORS
+from comvla_client.snr import __all__ as SNR_NAMES
 from comvla_server.metrics import Metrics
 from comvla_server.service import STATUS
 from comvla_server.setting_fields import fields_of
@@ -82,3 +83,9 @@ def test_the_edge_guide_names_every_selector_and_every_field_of_the_report() -> 
         name for row in markdown.table(EDGE, "fields") for name in re.findall(r"`(\w+)`", row[0])
     }
     assert named == set(StepReport.__dataclass_fields__)
+
+
+def test_the_edge_guide_names_every_snr_source() -> None:
+    rows = markdown.table(EDGE, "source")
+    named = {name for row in rows for name in re.findall(r"`(\w+Snr)\(", row[0])}
+    assert named == {name for name in SNR_NAMES if name.endswith("Snr")}

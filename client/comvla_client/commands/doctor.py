@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import importlib.util
 import json
-import socket
-import statistics
-import time
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
 
-from comvla import handshake
-from comvla.codec import bits_per_value
-from comvla.errors import ComVLAError
-from comvla.model_info import ModelInfo
-from comvla_client import channel
-from comvla_client.budget import framed_token_budget, token_budget
+from comvla.errors import LinkError
+from comvla_client.access import Access
 from comvla_client.commands.arguments import (
     Subparsers,
     access_of,
@@ -28,37 +19,28 @@ from comvla_client.commands.arguments import (
     load_edge,
     tls_of,
 )
-from comvla_client.errors import TransportError
-from comvla_client.health import check_health
-from comvla_client.locked_out import locked_out
+from comvla_client.diagnosis import goodput, reach, round_trips, server, silence, tokens
+from comvla_client.diagnosis.finding import Allowance, Finding
+from comvla_client.diagnosis.machine import machine
 from comvla_client.transport import GrpcTransport
 
-USEFUL_TOKENS = 20
-"""Fewer than about this many of 512 tokens, and the paper's success collapses (Table I, K = 16)."""
-
 _DESCRIPTION = """\
-Looks at a server from here: is the port open, does a ComVLA server answer, is it healthy, how long
-is the way there and back, and how many tokens does the link carry. Each finding has its remedy.
+Looks at a server from here: is the port open, does a ComVLA server answer, is it healthy and idle,
+how long is the way, what does the uplink carry, what does silence cost, how many tokens is that, and
+how is this machine set up. Each finding has its remedy.
+
+  ok    as it should be
+  note  could be better, and was not seen to do harm
+  FAIL  stands in the robot's way
+  skip  could not be looked at
+
+The status is 0 without a FAIL, 1 with one, 2 where the examination could not be made.
+
+It sends what robots send: small calls, uploads that the server reads and refuses (its log shows
+them), and up to three real queries of one token.
 """
 
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was looked at.
-
-    Attributes:
-        check: its name.
-        ok: whether it is as it should be.
-        found: what was measured or read.
-        remedy: what to do about it; empty when all is well.
-        values: the numbers behind ``found``, for ``--json``.
-    """
-
-    check: str
-    ok: bool
-    found: str
-    remedy: str = ""
-    values: dict[str, Any] = dataclasses.field(default_factory=dict)
+_MARKS = {"ok": "ok  ", "note": "note", "fail": "FAIL", "skip": "skip"}
 
 
 def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
@@ -71,10 +53,29 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     )
     add_target(parser)
     parser.add_argument(
-        "--calls", type=int, default=20, metavar="N", help="small calls to time (default: 20)"
+        "--seconds",
+        type=float,
+        default=15.0,
+        metavar="S",
+        help="longest that the examination may take (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--calls", type=int, default=100, metavar="N", help="small calls to time (default: 100)"
     )
     parser.add_argument(
         "--edge", metavar="SOURCE", help="also compare this robot's half of a model"
+    )
+    parser.add_argument(
+        "--tokens",
+        type=int,
+        metavar="K",
+        help="tokens of the query whose time is estimated (default: K* of the link below)",
+    )
+    parser.add_argument(
+        "--instruction",
+        default="push the green drawer shut",
+        metavar="WORDS",
+        help="of the real queries; words that the server's model knows (default: %(default)r)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_link(parser)
@@ -82,36 +83,52 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints the findings as they come. 0 when all are well, else 1."""
+    """Prints the findings as they come, and a verdict. 0 without a fail, else 1."""
     findings = []
     for finding in examine(arguments):
         findings.append(finding)
         if not arguments.json:
-            print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.check:<10} {finding.found}")
+            print(f"{_MARKS[finding.status]} {finding.check:<10} {finding.found}", flush=True)
             if finding.remedy:
-                print(f"     {'':<10} {finding.remedy}")
-    healthy = all(finding.ok for finding in findings)
+                print(f"     {'':<10} -> {finding.remedy}", flush=True)
+    failed = [finding.check for finding in findings if not finding.ok]
+    verdict = f"{len(failed)} to mend: {', '.join(failed)}" if failed else "fine"
     if arguments.json:
-        rows = [dataclasses.asdict(finding) for finding in findings]
-        print(json.dumps({"target": arguments.target, "ok": healthy, "findings": rows}))
-    return 0 if healthy else 1
+        rows = [finding.to_dict() for finding in findings]
+        print(
+            json.dumps(
+                {
+                    "target": arguments.target,
+                    "ok": not failed,
+                    "verdict": verdict,
+                    "findings": rows,
+                }
+            )
+        )
+    else:
+        print(f"verdict: {verdict}")
+    return 1 if failed else 0
 
 
 def examine(arguments: argparse.Namespace) -> Iterator[Finding]:
     """Looks closer step by step; stops where nothing further can be told.
 
     Raises:
-        LinkError: link arguments out of range.
+        LinkError: link arguments, or a time, out of range.
         HandshakeError: the target is no address.
         AccessError: certificates or a token that cannot be used.
     """
     # A mistyped link or an unreadable file is an error of the command, not a finding.
     link_of(arguments)
-    access_of(arguments)
+    access = access_of(arguments)
+    if not (math.isfinite(arguments.seconds) and arguments.seconds > 0.0):
+        raise LinkError(f"expected --seconds > 0, got {arguments.seconds}: how long it may take")
+    target = access.target
+    allowance = Allowance(arguments.seconds)
     yield _torch()
-    reach = _reach(channel.check_target(arguments.target), arguments.connect_timeout_s)
-    yield reach
-    if not reach.ok:
+    reached, path = reach.reach(target, allowance.at_most_s(arguments.connect_timeout_s))
+    yield reached
+    if path is None:
         return
     transport = GrpcTransport(
         arguments.target,
@@ -120,145 +137,71 @@ def examine(arguments: argparse.Namespace) -> Iterator[Finding]:
         insecure=arguments.insecure,
     )
     try:
-        try:
-            response = transport.get_model(arguments.connect_timeout_s)
-            model = handshake.from_response(response)
-        except (TransportError, ComVLAError) as error:
-            yield _no_handshake(arguments, error)
-            return
-        yield Finding(
-            "handshake",
-            True,
-            f"{model.name} {model.fingerprint[:12]} on comvla-server {response.server_version}: "
-            f"N {model.num_tokens}, D {model.token_dim}, chunks of {model.action_horizon}",
-            values={"model": dataclasses.asdict(model), "server_version": response.server_version},
-        )
-        if arguments.edge is not None:
-            yield _edge(arguments.edge, model)
-        yield _health(arguments)
-        yield _round_trips(transport, arguments, model)
-        yield _link(arguments, model)
+        yield from _beyond(arguments, access, transport, path, allowance)
     finally:
         transport.close()
 
 
+def _beyond(
+    arguments: argparse.Namespace,
+    access: Access,
+    transport: GrpcTransport,
+    path: reach.Path,
+    allowance: Allowance,
+) -> Iterator[Finding]:
+    """All that needs an open port."""
+    timeout_s = allowance.at_most_s(arguments.connect_timeout_s)
+    shaken, response, model = server.shake_hands(transport, access.target, timeout_s)
+    yield shaken
+    if response is None or model is None:
+        return
+    if arguments.edge is not None:
+        yield server.same_model(arguments.edge, load_edge(arguments.edge).info, model)
+    yield server.health(access, max(allowance.at_most_s(arguments.connect_timeout_s), 0.1))
+    with silence.SilentConnection(access, max(allowance.at_most_s(1.0), 0.1)) as silent:
+        timed, trips = round_trips.round_trips(
+            transport, arguments.calls, model, allowance, timeout_s
+        )
+        yield timed
+        if trips is None:
+            return
+        asked, answers = server.queries(
+            transport, model, arguments.instruction, arguments.quantization, allowance
+        )
+        yield asked
+        if answers is not None:
+            yield server.load(answers)
+            yield server.clock(answers)
+        carried, seen = goodput.goodput(
+            transport, trips.median_s, response.max_request_bytes, allowance
+        )
+        yield carried
+        rested, idle_costs = silence.idle_restart(transport, trips.median_s, seen, allowance)
+        yield rested
+        link, quantization = link_of(arguments), arguments.quantization
+        yield tokens.by_formula(arguments.snr_db, link, model, quantization)
+        if seen is not None:
+            yield tokens.by_goodput(seen, link, model, quantization, arguments.snr_db)
+            server_s = 0.0 if answers is None else answers.server_s
+            count = arguments.tokens or tokens.framed_budget(
+                arguments.snr_db, link, model, quantization
+            )
+            yield tokens.expected_period(
+                count,
+                seen,
+                trips.median_s,
+                server_s,
+                link,
+                model,
+                quantization,
+            )
+        yield from machine(path, idle_costs)
+        yield silent.finding(allowance)
+
+
 def _torch() -> Finding:
     if importlib.util.find_spec("torch") is not None:
-        return Finding("torch", True, "installed, so an edge model can run here")
+        return Finding("torch", "ok", "installed, so an edge model can run here")
     return Finding(
-        "torch", False, "not installed", "to run an edge model here: pip install 'comvla[edge]'"
-    )
-
-
-def _reach(target: str, timeout_s: float) -> Finding:
-    host, _, port = target.rpartition(":")
-    began = time.perf_counter()
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout_s).close()
-    except OSError as error:
-        return Finding(
-            "reach",
-            False,
-            f"no TCP connection to {target} within {timeout_s:g} s: {error}",
-            "start `comvla-server serve` there, listening on an address that this robot reaches "
-            "(--host 0.0.0.0 with TLS opens it to the network); check the port, the route and the firewall",
-        )
-    elapsed_s = time.perf_counter() - began
-    return Finding("reach", True, f"TCP connects in {1e3 * elapsed_s:.1f} ms")
-
-
-def _no_handshake(arguments: argparse.Namespace, error: ComVLAError) -> Finding:
-    if isinstance(error, TransportError) and locked_out(error) is not None:
-        return Finding(
-            "access",
-            False,
-            f"{error.code}: {error.message}",
-            f"a server is there, but {locked_out(error)}",
-        )
-    if isinstance(error, TransportError):
-        error = channel.no_server(arguments.target, error, arguments.connect_timeout_s)
-    return Finding(
-        "handshake",
-        False,
-        str(error),
-        "the port is open, so give the gRPC address that comvla-server printed when it was ready, "
-        "not the one of its admin surface; if it still loads its model, wait",
-    )
-
-
-def _edge(source: str, cloud: ModelInfo) -> Finding:
-    difference = handshake.mismatch(load_edge(source).info, cloud)
-    if difference is None:
-        return Finding("edge", True, f"{source} is the other half of the server's model")
-    return Finding("edge", False, difference, "start both sides with the same checkpoint")
-
-
-def _health(arguments: argparse.Namespace) -> Finding:
-    try:
-        status = check_health(access_of(arguments), arguments.connect_timeout_s)
-    except TransportError as error:
-        return Finding(
-            "health",
-            False,
-            f"no answer from grpc.health.v1 ({error})",
-            "a proxy in between may not pass it on: allow the service grpc.health.v1.Health",
-        )
-    remedy = "" if status == "SERVING" else "the server is loading or stopping: wait, or restart it"
-    return Finding("health", status == "SERVING", status, remedy)
-
-
-def _round_trips(
-    transport: GrpcTransport, arguments: argparse.Namespace, model: ModelInfo
-) -> Finding:
-    elapsed_s = []
-    try:
-        for _ in range(max(2, arguments.calls)):
-            began = time.perf_counter()
-            transport.get_model(arguments.connect_timeout_s)
-            elapsed_s.append(time.perf_counter() - began)
-    except TransportError as error:
-        return Finding(
-            "round trip",
-            False,
-            f"lost after {len(elapsed_s)} calls ({error})",
-            "the link or the server is unsteady: look at the server's log and the radio",
-        )
-    median_s, worst_s = statistics.median(elapsed_s), max(elapsed_s)
-    quick = worst_s <= model.control_period_s
-    return Finding(
-        "round trip",
-        quick,
-        f"{len(elapsed_s)} small calls: median {1e3 * median_s:.2f} ms, worst {1e3 * worst_s:.2f} ms",
-        ""
-        if quick
-        else f"longer than one control period ({1e3 * model.control_period_s:.0f} ms): move the "
-        "server closer, or let the robot execute longer chunks before it asks again",
-        {"calls": len(elapsed_s), "median_s": median_s, "worst_s": worst_s},
-    )
-
-
-def _link(arguments: argparse.Namespace, model: ModelInfo) -> Finding:
-    link, quantization = link_of(arguments), arguments.quantization
-    bits_per_token = model.token_dim * bits_per_value(quantization)
-    paper = token_budget(arguments.snr_db, link, bits_per_token)
-    framed = framed_token_budget(
-        arguments.snr_db,
-        link,
-        token_dim=model.token_dim,
-        quantization=quantization,
-        num_towers=len(model.tower_dims),
-        proprio_dim=model.proprio_dim,
-        model_fingerprint=model.fingerprint,
-    )
-    enough = framed >= min(USEFUL_TOKENS, model.num_tokens)
-    return Finding(
-        "link",
-        enough,
-        f"at {arguments.snr_db:g} dB {quantization} K* is {paper} by Eq. (4), {framed} with framing, "
-        f"of {model.num_tokens} tokens",
-        ""
-        if enough
-        else f"below about {USEFUL_TOKENS} tokens policies lose the task: raise bandwidth, power or "
-        "period, or choose a coarser quantization",
-        {"token_budget": paper, "framed_token_budget": framed},
+        "torch", "fail", "not installed", "to run an edge model here: pip install 'comvla[edge]'"
     )

@@ -21,6 +21,7 @@ from comvla_client.commands.arguments import (
     load_edge,
     tls_of,
 )
+from comvla_client.commands.snr_arguments import add_snr_source, opened
 from comvla_client.report import ActionChunk
 from comvla_client.selection import SELECTORS
 from comvla_client.sending import POLICIES
@@ -87,6 +88,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of the synthetic observation")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_link(parser)
+    add_snr_source(parser)
     return parser
 
 
@@ -94,22 +96,26 @@ def run(arguments: argparse.Namespace) -> int:
     """Sends the observation. 0 when the cloud answered, 1 when the robot had to fall back."""
     edge = load_edge(arguments.edge)
     obs = _observation(arguments, edge.info)
-    with ComVLAClient(
-        arguments.target,
-        edge=edge,
-        link=link_of(arguments),
-        quantization=arguments.quantization,
-        selector=arguments.selector,
-        budget="paper" if arguments.tokens is None else arguments.tokens,
-        sending=arguments.sending,
-        deadline_s=arguments.deadline_s,
-        connect_timeout_s=arguments.connect_timeout_s,
-        tls=tls_of(arguments),
-        token=arguments.token_file,
-        insecure=arguments.insecure,
-        seed=arguments.seed,
-    ) as client:
-        chunk = client.step(obs, arguments.instruction, arguments.snr_db)
+    with (
+        opened(arguments.snr_source, arguments.snr_db) as snr,
+        ComVLAClient(
+            arguments.target,
+            edge=edge,
+            link=link_of(arguments),
+            quantization=arguments.quantization,
+            selector=arguments.selector,
+            budget="paper" if arguments.tokens is None else arguments.tokens,
+            sending=arguments.sending,
+            deadline_s=arguments.deadline_s,
+            connect_timeout_s=arguments.connect_timeout_s,
+            tls=tls_of(arguments),
+            token=arguments.token_file,
+            insecure=arguments.insecure,
+            seed=arguments.seed,
+            snr=snr,
+        ) as client,
+    ):
+        chunk = client.step(obs, arguments.instruction)
     if arguments.json:
         print(json.dumps({"actions": chunk.actions.tolist(), "report": chunk.report.to_dict()}))
     else:

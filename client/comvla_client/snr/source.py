@@ -1,4 +1,4 @@
-"""Where the signal-to-noise ratio of the link comes from."""
+"""Readings of the link's signal-to-noise ratio, and what can give them."""
 
 from __future__ import annotations
 
@@ -18,23 +18,31 @@ class SnrReading:
     Attributes:
         snr_db: signal-to-noise ratio in dB; −inf means no link.
         age_s: seconds since it was measured. At 10 Hz Doppler anything older than 20 ms says little.
+        std_db: standard deviation in dB of the SNR now, given all that the source knows; None where
+            it does not say.
 
     Raises:
-        LinkError: the SNR is NaN or +inf, or the age is negative or not finite.
+        LinkError: the SNR is NaN or +inf, or the age or deviation is negative or not finite.
     """
 
     snr_db: float
     age_s: float = 0.0
+    std_db: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "snr_db", check_snr_db(self.snr_db))
         if not (math.isfinite(self.age_s) and self.age_s >= 0.0):
             raise LinkError(f"expected an SNR age in seconds >= 0, got {self.age_s!r}")
+        if self.std_db is not None and not (math.isfinite(self.std_db) and self.std_db >= 0.0):
+            raise LinkError(f"expected an SNR deviation in dB >= 0, got {self.std_db!r}")
 
 
 @runtime_checkable
 class SnrSource(Protocol):
-    """Anything that can tell the SNR when a step asks for it."""
+    """Anything that can tell the SNR when a step asks for it.
+
+    A source that also has ``observe(report: StepReport)`` is told how each step of its client ended.
+    """
 
     def read(self) -> SnrReading:
         """The latest reading. Called once per step on the control thread, so it must not block."""
