@@ -17,6 +17,7 @@ class Reason(str, Enum):
     MISMATCH = "mismatch"  # another model or another protocol
     OVERSIZE = "oversize"  # message larger than the cap
     OVERLOAD = "overload"  # queue full
+    KEY_FRAME = "key_frame"  # a picture that builds on one which is not held here
     SUPERSEDED = "superseded"  # a newer observation of the session came
     DEADLINE = "deadline"  # too late to be of use
     CANCELLED = "cancelled"  # the robot hung up

@@ -68,6 +68,13 @@ def add_parser(subparsers: Any) -> None:
         help="data set whose statistics apply, where the checkpoint holds several",
     )
     model.add_argument(
+        "--vision",
+        default="auto",
+        choices=("auto", "on", "off"),
+        help="also load the vision half, for robots that send pictures; auto: where the checkpoint on this "
+        "machine is whole. It takes the memory of the towers, which the log names (default: auto)",
+    )
+    model.add_argument(
         "--fastv",
         type=_fastv,
         metavar="LAYER,DROP",
@@ -157,6 +164,7 @@ def run(args: argparse.Namespace) -> int:
                 args.fastv,
                 args.compact_positions,
                 args.compile,
+                args.vision,
             ),
         )
     )
@@ -171,8 +179,9 @@ def load_engine(
     fastv: tuple[int, float] | None = None,
     compact_positions: bool = False,
     compiled: bool = False,
+    vision: str = "auto",
 ) -> Engine:
-    """The cloud half of a checkpoint, ready to run.
+    """The cloud half of a checkpoint, ready to run; with the vision half where that is wanted.
 
     Raises:
         CheckpointError: missing, damaged, foreign or incomplete.
@@ -180,6 +189,7 @@ def load_engine(
     import torch
 
     from comvla_server.engine import Engine
+    from comvla_server.vision import holds_whole, load_vision
     from comvla_vla import CloudOptions, FastV, load_cloud
 
     if threads is not None:
@@ -189,15 +199,16 @@ def load_engine(
         compact_positions=compact_positions,
         compile=compiled,
     )
-    return Engine(
-        load_cloud(
-            model,
-            device=device,
-            dtype=getattr(torch, dtype),
-            statistics_key=statistics_key,
-            options=options,
-        )
+    cloud = load_cloud(
+        model,
+        device=device,
+        dtype=getattr(torch, dtype),
+        statistics_key=statistics_key,
+        options=options,
     )
+    if vision == "off" or (vision == "auto" and not holds_whole(model)):
+        return Engine(cloud)
+    return Engine(cloud, load_vision(model, cloud, device, statistics_key=statistics_key))
 
 
 def _fastv(text: str) -> tuple[int, float]:

@@ -7,14 +7,17 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import grpc
 
 from comvla import codec, handshake
 from comvla.errors import CodecError
+from comvla.images import picture_bytes
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.batcher import Batcher
+from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.log_throttle import LogThrottle
@@ -25,6 +28,7 @@ from comvla_server.tickets import Answer
 from comvla_server.validation import Validator, content_digest
 from comvla_server.version import server_version
 from comvla_server.wording import shown
+from comvla_vla.request import AnyRequest
 
 _log = logging.getLogger(__name__)
 
@@ -38,6 +42,7 @@ STATUS = {
     Reason.MISMATCH: grpc.StatusCode.FAILED_PRECONDITION,
     Reason.OVERSIZE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.OVERLOAD: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Reason.KEY_FRAME: grpc.StatusCode.ABORTED,
     Reason.SUPERSEDED: grpc.StatusCode.ABORTED,
     Reason.DEADLINE: grpc.StatusCode.DEADLINE_EXCEEDED,
     Reason.CANCELLED: grpc.StatusCode.CANCELLED,
@@ -54,6 +59,7 @@ class Runtime:
     engine: Engine
     batcher: Batcher
     validator: Validator
+    decoding: Decoding
 
 
 class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
@@ -100,6 +106,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             quantizations=codec.QUANTIZATIONS,
             max_request_bytes=self._settings.max_request_bytes,
             server_version=server_version(),
+            image_codings=runtime.engine.image_codings,
         )
 
     async def Infer(
@@ -189,13 +196,18 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         digest = content_digest(request)
         batcher = runtime.batcher
         ticket = batcher.find(request.session_id, request.step, digest)
-        repeat = ticket is not None
-        on_record = ticket is not None and ticket.outcome.done()
         decode_s = 0.0
+        policy_request: AnyRequest | None = None
         if ticket is None:
-            policy_request = runtime.validator.read(request)
+            policy_request = await self._read(runtime, request, deadline_s)
             decode_s = self._clock() - started_s
             self._metrics.step_phase.labels("decode").observe(decode_s)
+            # While pictures were decoded, a repeat of this step or a newer one may have come.
+            ticket = batcher.find(request.session_id, request.step, digest)
+        repeat = ticket is not None
+        on_record = ticket is not None and ticket.outcome.done()
+        if ticket is None:
+            assert policy_request is not None
             ticket = batcher.admit(request.session_id, request.step, policy_request, digest)
         answer = await batcher.wait(ticket, deadline_s)
         response = self._response(request, runtime, answer)
@@ -205,6 +217,15 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             response.timings.predict_s = answer.predict_s
         response.timings.total_s = self._clock() - started_s
         return response, repeat
+
+    async def _read(
+        self, runtime: Runtime, request: policy_pb2.InferRequest, deadline_s: float
+    ) -> AnyRequest:
+        """Tokens here and now, which takes microseconds; pictures in their own thread."""
+        read = partial(runtime.validator.read, request)
+        if request.HasField("images"):
+            return await runtime.decoding.run(read, deadline_s)
+        return read()
 
     def _response(
         self, request: policy_pb2.InferRequest, runtime: Runtime, answer: Answer
@@ -230,6 +251,11 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         metrics, payload = self._metrics, request.payload
         metrics.tx_framed_bytes.inc(codec.wire_bytes(request.ByteSize()))
         metrics.tx_encoded_bytes.inc(len(payload))
+        if request.HasField("images"):
+            metrics.tx_encoded_bytes.inc(request.images.ByteSize())
+            metrics.tx_image_bytes.inc(picture_bytes(request.images))
+            metrics.tx_payload_bytes.inc(picture_bytes(request.images))
+            return
         try:
             header = codec.read_header(payload)
         except CodecError:

@@ -16,13 +16,14 @@ from comvla_vla.config import ModelConfig
 from comvla_vla.edge import EdgeModel
 from comvla_vla.options import CloudOptions, FastV
 from comvla_vla.random import random_policy
-from comvla_vla.request import PolicyRequest
+from comvla_vla.request import ImageRequest, PolicyRequest
 
 __all__ = [
     "CloudModel",
     "CloudOptions",
     "EdgeModel",
     "FastV",
+    "ImageRequest",
     "ModelConfig",
     "PolicyRequest",
     "Recipe",
