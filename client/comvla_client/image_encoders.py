@@ -80,6 +80,8 @@ class StillEncoder:
         if quality is not None and not 1 <= quality <= 100:
             raise ValueError(f"expected a {coding} quality from 1 to 100, got {quality}")
         stills.require(coding)
+        # The first picture of a coding loads its library; no step shall wait for that.
+        stills.encode_still(coding, np.zeros((16, 16, 3), np.uint8), 50)
         self.coding = coding
         self.qualities = ADJUSTABLE if quality is None else (quality,)
 

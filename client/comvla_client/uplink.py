@@ -1,10 +1,10 @@
 """What goes up the link for one observation: the interface of all its forms.
 
-A form is told once who the robot is (:class:`Setup`), and then asked for each step what shall be sent
-(:meth:`UplinkForm.compress`), in as many tokens or bytes as its :class:`~comvla_client.sizing.Sizer` made of what the
-link carries. Tokens by a selector are
-the product (:class:`comvla_client.token_uplink.TokenUplink`); coded pictures, which the cloud has to look at, are what everybody
-else does (:class:`comvla_client.image_uplink.ImageUplink`). :mod:`comvla_client.registry` knows both by name.
+A form is told once who the robot is (:class:`Setup`), and then asked for each step what shall be
+sent (:meth:`UplinkForm.compress`), in as many tokens or bytes as its sizer made of what the link
+carries. Tokens by a selector are the product (:class:`comvla_client.token_uplink.TokenUplink`);
+coded pictures, which the cloud has to look at, are what everybody else sends
+(:class:`comvla_client.image_uplink.ImageUplink`). :mod:`comvla_client.registry` knows both by name.
 """
 
 from __future__ import annotations

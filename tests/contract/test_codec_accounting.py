@@ -130,6 +130,7 @@ def test_infer_request_bytes_knows_every_field_with_a_one_byte_tag() -> None:
         "snr_db",
         "snr_age_s",
         "protocol_version",
+        "images",
     }
     assert max(field.number for field in fields) < 16
 
