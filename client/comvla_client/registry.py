@@ -239,7 +239,7 @@ def make_selector(selector: str | Selector) -> Selector:
     if not isinstance(selector, str):
         return selector
     made = find_entry(selector).make()
-    if not _selects(made):
+    if not selects(made):
         raise UnknownMethodError(
             f"{selector!r} selects no tokens: pass it as uplink=, or as selector= one of "
             f"{', '.join(selectors())}"
@@ -262,7 +262,7 @@ def make_uplink(
     if not isinstance(uplink, str):
         return uplink
     made = find_entry(uplink).make()
-    return TokenUplink(made, uplink) if _selects(made) else made
+    return TokenUplink(made, uplink) if selects(made) else made
 
 
 def table() -> str:
@@ -276,7 +276,8 @@ def table() -> str:
     return "\n".join(f"  {name:{width}}  {summary}" for name, summary in rows)
 
 
-def _selects(made: Selector | UplinkForm) -> TypeIs[Selector]:
+def selects(made: Selector | UplinkForm) -> TypeIs[Selector]:
+    """Whether this is a selector, and not a whole uplink form."""
     return hasattr(made, "rank")
 
 
