@@ -47,15 +47,16 @@ def _webp_end(data: bytes) -> int:
 
 
 def _avif_end(data: bytes) -> int:
-    """Offset behind the last box of a file that begins with an AVIF one."""
+    """Offset behind the three boxes that a picture consists of."""
     if data[4:8] != b"ftyp" or data[8:12] not in (b"avif", b"mif1"):
         raise _not("avif", data)
-    at = 0
-    while at < len(data):
-        size = int.from_bytes(data[at : at + 4], "big")
+    at, missing = 0, {b"ftyp", b"meta", b"mdat"}
+    while missing:
+        size, box = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
         # Sizes 0 (to the end) and 1 (64 bits) are legal and never needed for a picture this small.
-        if size < 8:
+        if size < 8 or box not in missing:
             raise _not("avif", data)
+        missing.remove(box)
         at += size
     return at
 

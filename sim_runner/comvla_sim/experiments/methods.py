@@ -28,7 +28,7 @@ class Method:
         name: as asked for.
         summary, equation, source: as in :class:`comvla_client.registry.Entry`.
         make: gives a new uplink form, or a selector that makes one.
-        in_cloud: what it needs of the cloud half; None for nothing.
+        in_cloud: what it needs of a cloud half of so many layers; None for nothing.
         server_option: the same for ``comvla-server serve``.
     """
 
@@ -37,7 +37,7 @@ class Method:
     equation: str
     source: str
     make: Callable[..., Selector | UplinkForm]
-    in_cloud: Callable[[], CloudOptions] | None = None
+    in_cloud: Callable[[int], CloudOptions] | None = None
     server_option: str = ""
 
     def form(self) -> UplinkForm:
@@ -71,10 +71,11 @@ class Method:
         return selector is None or selector.sends_all
 
 
-def _fastv() -> CloudOptions:
+def _fastv(layers: int) -> CloudOptions:
     from comvla_vla import CloudOptions, FastV
 
-    return CloudOptions(fastv=FastV())
+    # Its authors' third layer is the last but one of the small policy's three: behind the last nothing is saved.
+    return CloudOptions(fastv=FastV(layer=min(FastV().layer, layers - 1)))
 
 
 _IN_CLOUD = (

@@ -143,7 +143,7 @@ class Worker:
         key = method.server_option
         if key not in self._targets:
             if method.in_cloud is not None:
-                cloud = cloud.with_options(method.in_cloud())
+                cloud = cloud.with_options(method.in_cloud(cloud.config.backbone.layers))
             vision = VisionHalf(self._edge)  # type: ignore[arg-type]
             self._targets[key] = InProcessTransport(cloud, vision)
         return self._targets[key]
