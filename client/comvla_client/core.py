@@ -177,6 +177,8 @@ class ClientCore:
         rng = np.random.default_rng([self._seed, self._episode, self._step])
         self._step += 1
         if plan.count == 0:
+            if not self._form.in_pieces:
+                plan = replace(plan, detail="the link carries too few bytes for any picture")
             return Prepared(None, report, started, deadline, plan)
         uplink = self._form.compress(checked, plan.count, rng)
         report = replace(
