@@ -22,6 +22,7 @@ from comvla_client.sending import SendingPolicy
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading
 from comvla_client.transport_aio import AsyncTransport, GrpcAioTransport
+from comvla_client.uplink import UplinkForm
 
 
 class AsyncComVLAClient:
@@ -36,10 +37,11 @@ class AsyncComVLAClient:
         self,
         target: str | AsyncTransport,
         *,
-        edge: EdgeModel,
+        edge: EdgeModel | ModelInfo | None = None,
         link: LinkProfile = PAPER_LINK,
         quantization: str = "int8",
         selector: str | Selector = "hard_voting",
+        uplink: str | UplinkForm | None = None,
         budget: Budget = "paper",
         sending: str | SendingPolicy = "paper",
         snr: SnrInput | None = None,
@@ -59,6 +61,7 @@ class AsyncComVLAClient:
             link=link,
             quantization=quantization,
             selector=selector,
+            uplink=uplink,
             budget=budget,
             sending=sending,
             snr=snr,

@@ -37,6 +37,7 @@ _OVERSIZE = ("larger than max", "request of at most")
 # The server's words for what it could not accept, most telling first.
 _INVALID: tuple[tuple[str, type[ComVLAError]], ...] = (
     ("propriocep", ObservationError),
+    ("picture", ObservationError),
     ("instruction", InstructionError),
     ("payload", CodecError),
     ("token", CodecError),

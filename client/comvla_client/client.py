@@ -22,6 +22,7 @@ from comvla_client.sending import SendingPolicy
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading
 from comvla_client.transport import GrpcTransport, Transport
+from comvla_client.uplink import UplinkForm
 
 
 class ComVLAClient:
@@ -38,12 +39,16 @@ class ComVLAClient:
 
     Args:
         target: ``host:port`` of a server, or a transport of your own, which the client then owns.
-        edge: the robot's half of the model, e.g. ``comvla_vla.load_edge("mini")``.
+        edge: the robot's half of the model, e.g. ``comvla_vla.load_edge("mini")``. A robot that sends
+            pictures needs none: a ``ModelInfo`` of the model that it expects, or None to take the
+            server's word for it.
         link: bandwidth, period and efficiency of the radio link.
         quantization: how token values are coded: float32, float16, int8 or int4.
-        selector: ranking of tokens, by name (:data:`comvla_client.selection.SELECTORS`) or your own.
+        selector: ranking of tokens, by name (:data:`comvla_client.registry.SELECTORS`) or your own.
+        uplink: what goes up the link. Default: tokens, by ``selector``. By name a picture coding, with
+            its quality or without ("jpeg-75", "jpeg", "webp-50", "avif-50", "h264"), or your own.
         budget: ``"paper"`` sizes payloads by Eq. (4), ``"framed"`` by all bytes that cross the wire;
-            a number sends that many tokens whatever the SNR.
+            a number sends that many tokens (bytes of pictures) whatever the SNR.
         sending: how much is sent when, by name (:data:`comvla_client.sending.POLICIES`) or an object
             of your own: ``"paper"`` takes the reported SNR at its word, ``"margin"`` sends what very
             likely fits, given the report's age, ``"progressive"`` sends the most important tokens
@@ -77,10 +82,11 @@ class ComVLAClient:
         self,
         target: str | Transport,
         *,
-        edge: EdgeModel,
+        edge: EdgeModel | ModelInfo | None = None,
         link: LinkProfile = PAPER_LINK,
         quantization: str = "int8",
         selector: str | Selector = "hard_voting",
+        uplink: str | UplinkForm | None = None,
         budget: Budget = "paper",
         sending: str | SendingPolicy = "paper",
         snr: SnrInput | None = None,
@@ -100,6 +106,7 @@ class ComVLAClient:
             link=link,
             quantization=quantization,
             selector=selector,
+            uplink=uplink,
             budget=budget,
             sending=sending,
             snr=snr,

@@ -16,23 +16,25 @@ from typing import Any
 
 import numpy as np
 
-from comvla import codec
+from comvla import codec, handshake
+from comvla.errors import HandshakeError
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
-from comvla_client.agreement import check_server
+from comvla_client.agreement import check_model
 from comvla_client.answers import fallback_reason, read_actions
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.edge import EdgeModel
 from comvla_client.errors import TransportError
 from comvla_client.observation import Observation, check_instruction, check_observation
 from comvla_client.queue import ActionQueue, Actions
+from comvla_client.registry import make_uplink
 from comvla_client.report import PHASES, ActionChunk, FallbackReason, Load, StepReport
-from comvla_client.selection import Selector, make_selector
+from comvla_client.selection import Selector
 from comvla_client.sending import Outcome, Plan, SendingPolicy, Situation, make_policy
 from comvla_client.sizing import Budget, TokenSizer
 from comvla_client.snr import SnrInput, SnrReading, as_reading, as_source
 from comvla_client.streaming import PayloadStream
-from comvla_client.uplink import TokenUplink
+from comvla_client.uplink import Setup, Uplink, UplinkForm
 
 WIND_UP_S = 0.002
 """What is kept of a deadline for giving up a call and writing the report, in seconds."""
@@ -50,6 +52,7 @@ class Prepared:
         started: when the step began, on ``time.perf_counter``.
         deadline: when its call has to be over, on the same clock.
         plan: what the policy of sending decided.
+        uplink: what is sent; None when nothing is.
         stream: the payload in pieces; ``request`` then has none. None where it goes whole.
     """
 
@@ -58,6 +61,7 @@ class Prepared:
     started: float
     deadline: float
     plan: Plan
+    uplink: Uplink | None = None
     stream: PayloadStream | None = None
 
     def remaining_s(self) -> float:
@@ -70,11 +74,12 @@ class ClientCore:
 
     def __init__(
         self,
-        edge: EdgeModel,
+        edge: EdgeModel | ModelInfo | None,
         *,
         link: LinkProfile = PAPER_LINK,
         quantization: str = "int8",
         selector: str | Selector = "hard_voting",
+        uplink: str | UplinkForm | None = None,
         budget: Budget = "paper",
         sending: str | SendingPolicy = "paper",
         snr: SnrInput | None = None,
@@ -85,29 +90,42 @@ class ClientCore:
         session_id: str | None = None,
         seed: int = 0,
     ) -> None:
-        self.info: ModelInfo = edge.info
-        self._any_image_size = bool(getattr(edge, "any_image_size", False))
-        self.queue = ActionQueue(self.info, execute=execute, hold=hold)
-        self.deadline_s = _check_deadline(
-            self.queue.execute * self.info.control_period_s if deadline_s is None else deadline_s
-        )
-        self._quantization = quantization
-        ranks = make_selector(selector)
-        self._sizer = TokenSizer(
-            self.info,
-            link,
-            quantization,
-            budget,
-            sends_all=ranks.sends_all,
-            min_tokens=min_tokens,
-        )
+        self._form = make_uplink(uplink, selector)
         self.sending = make_policy(sending)
-        self._uplink = TokenUplink(edge, ranks, quantization)
+        if self.sending.progressive and not self._form.in_pieces:
+            raise ValueError(
+                f"sending={self.sending.name!r} sends tokens piece by piece, {self._form.name} sends "
+                "pictures, which arrive whole or not at all: choose sending='paper', 'margin' or 'floor'"
+            )
+        self._edge = None if edge is None or isinstance(edge, ModelInfo) else edge
+        if self._form.needs_edge and self._edge is None:
+            raise ValueError(
+                f"{self._form.name} sends tokens, which takes the robot's half of the model: pass "
+                "edge=load_edge(...), or let the cloud see with uplink='jpeg-75'"
+            )
+        self._options = link, quantization, budget, min_tokens
+        self._execute, self._hold, self._deadline_s = execute, hold, deadline_s
+        self._info: ModelInfo | None = None
+        if edge is not None:
+            self._begin(edge if isinstance(edge, ModelInfo) else edge.info)
         self._snr = None if snr is None else as_source(snr)
         self._seed = seed
         self._session = _session_name(session_id)
         self._episode = 0
         self._step = 0
+
+    @property
+    def info(self) -> ModelInfo:
+        """The model that both sides run.
+
+        Raises:
+            HandshakeError: the robot has no half of its own, and has not asked the server yet.
+        """
+        if self._info is None:
+            raise HandshakeError(
+                "a robot without an edge model learns from the server what it runs: connect first"
+            )
+        return self._info
 
     @property
     def session(self) -> str:
@@ -120,7 +138,7 @@ class ClientCore:
         self._step = 0
         self.queue.clear()
         self.sending.reset()
-        self._uplink.reset()
+        self._form.reset()
 
     def accept_server(self, response: GetModelResponse) -> ModelInfo:
         """The handshake: the server's model, if it fits the robot's half.
@@ -128,13 +146,17 @@ class ClientCore:
         Raises:
             HandshakeError: the first difference in words, with its remedy.
         """
-        return check_server(
-            response,
-            self.info,
-            quantization=self._quantization,
-            most_tokens=self._sizer.most_tokens,
-            progressive=self.sending.progressive,
-        )
+        cloud = handshake.from_response(response)
+        if self._info is None:
+            self._begin(cloud)
+        check_model(cloud, self.info)
+        if self.sending.progressive and not response.progressive:
+            raise HandshakeError(
+                f"client sends payloads in pieces, server {response.server_version or 'of no version'} "
+                "has no InferProgressive: update the server, or choose sending='margin'"
+            )
+        self._form.check_server(response)
+        return cloud
 
     def prepare(
         self, obs: Observation, instruction: str, snr: float | SnrReading | None = None
@@ -146,7 +168,7 @@ class ClientCore:
         """
         started = time.perf_counter()
         checked = check_observation(obs, self.info, any_size=self._any_image_size)
-        queries = self._uplink.queries(check_instruction(instruction))
+        self._form.hear(check_instruction(instruction))
         reading = self._read_snr(snr)
         request = self._blank_request(instruction, checked.proprio.tolist(), reading)
         plan = self._plan(reading, request)
@@ -155,20 +177,26 @@ class ClientCore:
         rng = np.random.default_rng([self._seed, self._episode, self._step])
         self._step += 1
         if plan.count == 0:
+            if not self._form.in_pieces:
+                plan = replace(plan, detail="the link carries too few bytes for any picture")
             return Prepared(None, report, started, deadline, plan)
-        uplink = self._uplink.compress(checked, queries, plan.count, rng)
+        uplink = self._form.compress(checked, plan.count, rng)
+        report = replace(
+            report,
+            positions=uplink.positions,
+            image_quality=uplink.quality,
+            timings_s=dict.fromkeys(PHASES, 0.0) | uplink.timings_s,
+            edge_flops=uplink.flops,
+        )
+        if not uplink.sends:
+            plan = replace(plan, count=0, detail=uplink.refusal)
+            return Prepared(None, report, started, deadline, plan)
         stream = None
         if plan.progressive:
             stream = self._stream(request, uplink.payload, len(uplink.positions), plan)
         else:
-            request.payload = uplink.payload
-        report = replace(
-            report,
-            positions=uplink.positions,
-            timings_s=dict.fromkeys(PHASES, 0.0) | uplink.timings_s,
-            edge_flops=uplink.flops,
-        )
-        return Prepared(request, report, started, deadline, plan, stream)
+            uplink.fill(request)
+        return Prepared(request, report, started, deadline, plan, uplink, stream)
 
     def call(self, transport: Any, prepared: Prepared, timeout_s: float) -> Any:
         """Hands a step to a transport in the form that its plan asks for; the transport's result.
@@ -213,6 +241,7 @@ class ClientCore:
         except TransportError as error:
             return self.fail(prepared, error, call_s)
         self.queue.accept(actions)
+        self._form.settle(prepared.request.step, True)
         timings = response.timings
         report = replace(
             self._closed(prepared, call_s, response.tokens_used),
@@ -249,6 +278,8 @@ class ClientCore:
             HandshakeError, ObservationError, InstructionError, CodecError: a refusal that no later
                 step can mend, in the server's words.
         """
+        if prepared.request is not None:
+            self._form.settle(prepared.request.step, False)
         reason: FallbackReason = "no_link" if error is None else fallback_reason(error)
         detail = prepared.plan.detail if error is None else error.message
         actions, planned, source = self.queue.fall_back(hold=prepared.plan.hold)
@@ -277,7 +308,7 @@ class ClientCore:
     def _plan(self, reading: SnrReading | None, request: InferRequest) -> Plan:
         if reading is not None:
             self.sending.hear(reading)
-        sizer, link = self._sizer, self._sizer.link
+        sizer, link = self._form.sizer, self._form.sizer.link
 
         def tokens_in(bits: float, progressive: bool, least: int) -> int:
             return sizer.tokens_in(
@@ -288,7 +319,7 @@ class ClientCore:
             Situation(
                 reading=reading,
                 link=link,
-                num_tokens=self.info.num_tokens,
+                num_tokens=sizer.num_tokens,
                 most_tokens=sizer.most_tokens,
                 min_tokens=sizer.min_tokens,
                 tokens_in=tokens_in,
@@ -301,69 +332,86 @@ class ClientCore:
         report = StepReport(
             session=self.session,
             step=self._step,
+            uplink=self._form.name,
             policy=self.sending.name,
             token_budget=plan.budget,
             window_s=self._window_s(plan),
         )
         if reading is None:
             return report
-        bits = self._sizer.link.window_bits(reading.snr_db)
+        sizer = self._form.sizer
+        bits = sizer.link.window_bits(reading.snr_db)
+        budgets = sizer.token_budgets(
+            bits,
+            request,
+            progressive=plan.progressive,
+            least=plan.min_tokens,
+            window_s=report.window_s,
+        )
+        paper_budget, framed_budget = (None, None) if budgets is None else budgets
         return replace(
             report,
             snr_db=reading.snr_db,
             snr_age_s=reading.age_s,
             capacity_bits=bits,
-            paper_budget=self._sizer.paper_tokens(bits),
-            framed_budget=self._sizer.framed_tokens(
-                bits,
-                request,
-                progressive=plan.progressive,
-                least=plan.min_tokens,
-                window_s=report.window_s,
-            ),
+            paper_budget=paper_budget,
+            framed_budget=framed_budget,
         )
 
     def _window_s(self, plan: Plan) -> float:
-        link = self._sizer.link
+        link = self._form.sizer.link
         return (plan.periods - 1) * link.period_s + link.window_s
 
     def _stream(
         self, request: InferRequest, payload: bytes, count: int, plan: Plan
     ) -> PayloadStream:
-        window_s = self._window_s(plan)
+        sizer, window_s = self._form.sizer, self._window_s(plan)
+        assert isinstance(sizer, TokenSizer), "only tokens go in pieces"
         bits = 8.0 * len(payload) if plan.cap_bits is None else plan.cap_bits
-        ends = self._sizer.piece_ends(count, bits, plan.min_tokens)
+        ends = sizer.piece_ends(count, bits, plan.min_tokens)
         rate = None if plan.cap_bits is None else plan.cap_bits / 8.0 / window_s
         return PayloadStream(request, payload, ends, window_s, plan.min_tokens, rate)
 
     def _closed(self, prepared: Prepared, call_s: float, arrived: int = 0) -> StepReport:
         """The report with its times and with what crossed; the policy learns from it."""
-        report, request, stream = prepared.report, prepared.request, prepared.stream
+        report, uplink, stream = prepared.report, prepared.uplink, prepared.stream
         timings_s = report.timings_s | {
             "call": call_s,
             "total": time.perf_counter() - prepared.started,
         }
         report = replace(report, timings_s=timings_s)
+        offered = 0
         # Without a call nothing crossed the link.
-        if request is None or call_s == 0.0:
-            report = replace(report, positions=report.positions[:0])
-        else:
-            sent = len(report.positions) if stream is None else stream.taken_tokens
+        if uplink is None or prepared.request is None or call_s == 0.0:
+            report = replace(report, positions=report.positions[:0], image_quality=None)
+        elif stream is not None:
+            offered = stream.taken_tokens
             report = replace(
                 report,
-                tokens=sent,
-                positions=report.positions[:sent],
-                payload_bytes=self._payload_bytes(sent),
-                encoded_bytes=len(request.payload) if stream is None else stream.taken_bytes,
-                framed_bytes=codec.wire_bytes(request.ByteSize())
-                if stream is None
-                else stream.taken_wire_bytes,
+                tokens=offered,
+                positions=report.positions[:offered],
+                payload_bytes=self._payload_bytes(offered),
+                encoded_bytes=stream.taken_bytes,
+                framed_bytes=stream.taken_wire_bytes,
             )
+        else:
+            offered = len(uplink.positions) or uplink.payload_bytes
+            report = replace(
+                report,
+                tokens=len(uplink.positions),
+                payload_bytes=uplink.payload_bytes,
+                encoded_bytes=uplink.encoded_bytes,
+                framed_bytes=codec.wire_bytes(prepared.request.ByteSize()),
+            )
+        if report.tokens:
+            arrived_bits = 8.0 * self._payload_bytes(arrived)
+        else:  # pictures arrive whole or not at all
+            arrived_bits = 8.0 * report.payload_bytes if arrived else 0.0
         self.sending.learn(
             Outcome(
-                offered_tokens=report.tokens,
+                offered_tokens=offered,
                 arrived_tokens=arrived,
-                arrived_bits=8.0 * self._payload_bytes(arrived),
+                arrived_bits=arrived_bits,
                 answered=arrived > 0,
                 periods=prepared.plan.periods,
             )
@@ -371,7 +419,19 @@ class ClientCore:
         return report
 
     def _payload_bytes(self, tokens: int) -> int:
-        return codec.payload_bytes(tokens, self.info.token_dim, self._quantization)
+        return codec.payload_bytes(tokens, self.info.token_dim, self._options[1])
+
+    def _begin(self, info: ModelInfo) -> None:
+        """What waits until the model is known."""
+        self._info = info
+        # Without its own half a robot cannot know; what the server cannot take it refuses in words.
+        self._any_image_size = bool(getattr(self._edge, "any_image_size", self._edge is None))
+        self.queue = ActionQueue(info, execute=self._execute, hold=self._hold)
+        deadline_s = self._deadline_s
+        self.deadline_s = _check_deadline(
+            self.queue.execute * info.control_period_s if deadline_s is None else deadline_s
+        )
+        self._form.start(Setup(info, self._edge, *self._options))
 
     def _read_snr(self, snr: float | SnrReading | None) -> SnrReading | None:
         if snr is not None:

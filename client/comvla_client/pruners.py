@@ -8,14 +8,13 @@ split OpenVLA-OFT checkpoint carries. FastV ranks inside the backbone and is an 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import ClassVar, Protocol
 
 import numpy as np
 
 from comvla.errors import ObservationError
 from comvla_client.arrays import Array, NumpyArray, to_numpy
-from comvla_client.selection import ScoringContext, Selector
+from comvla_client.selection import ScoringContext
 
 
 class PruningEdge(Protocol):
@@ -165,10 +164,3 @@ def _robot(context: ScoringContext, name: str) -> tuple[PruningEdge, str, NumpyA
             "of them: rank through the client, or set edge=, instruction= and proprio="
         )
     return context.edge, context.instruction, context.proprio
-
-
-PRUNERS: dict[str, Callable[[], Selector]] = {
-    "lightvla": LightVLA,
-    "vla_adp": lambda: VLAADP(gate=MotionGate()),
-}
-"""Pruners by name, as their authors run them."""

@@ -44,6 +44,7 @@ class StepReport:
     Attributes:
         session: identity of the episode on the wire.
         step: number of the query in its session, from 0.
+        uplink: name of the form in which it was sent: a selector, or a picture coding such as jpeg-75.
         source: where the actions came from: ``cloud``, the ``rest`` of the last chunk, or ``hold``.
         fallback_reason: why not from the cloud; None where they are.
         detail: the server's or the channel's own words about a fallback.
@@ -52,15 +53,18 @@ class StepReport:
         capacity_bits: C_link of Eq. (1) at that SNR, over the period less the link's reserve; None
             without an SNR.
         policy: name of the policy of sending.
-        token_budget: what that policy allowed, before it is clipped to the N tokens there are.
-        paper_budget: K* of Eq. (4) at that SNR; None without an SNR.
-        framed_budget: the same by all bytes that cross the wire; None without an SNR.
+        token_budget: what that policy allowed, before it is clipped to the N tokens there are; bytes
+            where pictures are sent.
+        paper_budget: K* of Eq. (4) at that SNR; None without an SNR, or for pictures.
+        framed_budget: the same by all bytes that cross the wire; None as above.
         window_s: seconds that the payload had to cross.
-        tokens: tokens handed to the network.
-        tokens_used: tokens that the server received whole and used.
+        tokens: tokens handed to the network; 0 where pictures were.
+        tokens_used: tokens that the server received whole and used, or made of the pictures.
         positions: (K,) int32 positions sent, most important first.
-        payload_bytes: the paper's accounting, K·D·B/8.
-        encoded_bytes: length of the coded payload, with positions and scales.
+        image_quality: of the pictures, where the link decided it.
+        payload_bytes: the paper's accounting, K·D·B/8; for pictures their files.
+        encoded_bytes: length of the coded payload, with positions and scales, or of the pictures with
+            their sizes.
         framed_bytes: what crossed the socket for the request: protobuf, gRPC and HTTP/2 framing.
         timings_s: seconds by phase on the robot's clock: those of :data:`PHASES`.
         server_timings_s: seconds by phase on the server's clock: decode, queue, predict, total.
@@ -72,6 +76,7 @@ class StepReport:
 
     session: str
     step: int
+    uplink: str = ""
     source: Source = "hold"
     fallback_reason: FallbackReason | None = None
     detail: str = ""
@@ -86,6 +91,7 @@ class StepReport:
     tokens: int = 0
     tokens_used: int = 0
     positions: npt.NDArray[np.int32] = field(default_factory=_no_positions)
+    image_quality: int | None = None
     payload_bytes: int = 0
     encoded_bytes: int = 0
     framed_bytes: int = 0

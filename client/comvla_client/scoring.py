@@ -86,7 +86,7 @@ def soft_votes(queries: AnyArray, tokens: AnyArray) -> AnyArray:
     return votes
 
 
-def hard_importance(queries: Array, tokens: Array) -> Importance:
+def hard_importance(queries: Array, tokens: Array, votes_per_query: int = 1) -> Importance:
     """Hard votes together with the summed attention that breaks their ties, in one pass.
 
     A prompt of 20 to 40 words names at most that many of 512 tokens, so most of a ranking is tie-break.
@@ -94,14 +94,19 @@ def hard_importance(queries: Array, tokens: Array) -> Importance:
     Args:
         queries: (Q, d) language queries.
         tokens: (N, d) visual tokens in the queries' space.
+        votes_per_query: how many different tokens each query votes for, best first; the paper's is 1.
 
     Raises:
-        ValueError, TypeError: as in :func:`attention`.
+        ValueError, TypeError: as in :func:`attention`; or votes for fewer than 1 or more than N tokens.
     """
     _check(queries, tokens)
+    if not 1 <= votes_per_query <= tokens.shape[0]:
+        raise ValueError(
+            f"expected 1 to {tokens.shape[0]} votes per query, one for each token, got {votes_per_query}"
+        )
     if is_torch(queries) and is_torch(tokens):
-        return _hard_torch(_float_torch(queries), _float_torch(tokens))
-    return _hard_numpy(_float_numpy(queries), _float_numpy(tokens))
+        return _hard_torch(_float_torch(queries), _float_torch(tokens), votes_per_query)
+    return _hard_numpy(_float_numpy(queries), _float_numpy(tokens), votes_per_query)
 
 
 def soft_importance(queries: Array, tokens: Array) -> Importance:
@@ -120,11 +125,16 @@ def _attention_numpy(queries: NumpyArray, tokens: NumpyArray) -> NumpyArray:
     return weights
 
 
-def _hard_numpy(queries: NumpyArray, tokens: NumpyArray) -> Importance:
+def _hard_numpy(queries: NumpyArray, tokens: NumpyArray, votes_per_query: int) -> Importance:
     weights = _attention_numpy(queries, tokens)
-    task_tokens = weights @ tokens
-    winners = (task_tokens @ tokens.T).argmax(axis=1)
-    votes = np.bincount(winners, minlength=len(tokens))
+    likeness = weights @ tokens @ tokens.T
+    votes = np.zeros(len(tokens), dtype=np.int64)
+    # Best, second best, …: unlike a partition, argmax gives equals by index.
+    for more in reversed(range(votes_per_query)):
+        winners = likeness.argmax(axis=1)
+        votes += np.bincount(winners, minlength=len(tokens))
+        if more:
+            likeness[np.arange(len(winners)), winners] = -np.inf
     return Importance(votes=votes, attention=weights.sum(axis=0))
 
 
@@ -132,11 +142,18 @@ def _attention_torch(queries: torch.Tensor, tokens: torch.Tensor) -> torch.Tenso
     return (queries @ tokens.T).mul(1.0 / math.sqrt(queries.shape[1])).softmax(dim=1)
 
 
-def _hard_torch(queries: torch.Tensor, tokens: torch.Tensor) -> Importance:
+def _hard_torch(queries: torch.Tensor, tokens: torch.Tensor, votes_per_query: int) -> Importance:
     weights = _attention_torch(queries, tokens)
-    task_tokens = weights @ tokens
-    winners = (task_tokens @ tokens.T).argmax(dim=1)
-    return Importance(votes=winners.bincount(minlength=len(tokens)), attention=weights.sum(dim=0))
+    likeness = weights @ tokens @ tokens.T
+    votes = None
+    for more in reversed(range(votes_per_query)):
+        winners = likeness.argmax(dim=1)
+        cast = winners.bincount(minlength=len(tokens))
+        votes = cast if votes is None else votes + cast
+        if more:
+            likeness.scatter_(1, winners[:, None], -math.inf)
+    assert votes is not None
+    return Importance(votes=votes, attention=weights.sum(dim=0))
 
 
 def _float_numpy(values: Array) -> NumpyArray:

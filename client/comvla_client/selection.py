@@ -1,7 +1,7 @@
-"""Which tokens go first: from importance to an order, and the rankings that go by a name.
+"""Which tokens go first: from importance to an order, and the paper's own rankings.
 
-The tie-break is one function to swap. A new selector is one small class and one line in
-:data:`SELECTORS`.
+The tie-break is one function to swap. A new selector is one small class with a row in
+:mod:`comvla_client.registry`, where all of them go by a name; docs/selectors.md walks through one.
 """
 
 from __future__ import annotations
@@ -152,8 +152,12 @@ class Selector(Protocol):
         ...
 
 
-class _Voting:
-    """What the two ways of voting share: score, then sort with a tie-break."""
+class Voting:
+    """What all ways of voting share: score, then sort with a tie-break.
+
+    Args:
+        tie_break: second key where votes are equal.
+    """
 
     uses_language: ClassVar[bool] = True
     sends_all: ClassVar[bool] = False
@@ -162,14 +166,16 @@ class _Voting:
         self.tie_break = tie_break
 
     def importance(self, context: ScoringContext) -> Importance:
+        """Scores (N,) of the tokens, with what breaks their ties."""
         raise NotImplementedError
 
     def rank(self, context: ScoringContext) -> NumpyArray:
+        """All positions by falling importance."""
         importance = self.importance(context)
         return to_numpy(select(importance, context.tokens.shape[0], self.tie_break), np.int32)
 
 
-class HardVoting(_Voting):
+class HardVoting(Voting):
     """The paper's ranking, Eq. (3): votes, then summed attention, then index."""
 
     def importance(self, context: ScoringContext) -> Importance:
@@ -177,12 +183,35 @@ class HardVoting(_Voting):
         return hard_importance(context.queries, context.language_tokens)
 
 
-class SoftVoting(_Voting):
+class SoftVoting(Voting):
     """The comparison of Table III: summed attention as the score."""
 
     def importance(self, context: ScoringContext) -> Importance:
         """Attention of the instruction's queries on the projected tokens."""
         return soft_importance(context.queries, context.language_tokens)
+
+
+class HardVotingRandomTies:
+    """Hard votes with ties drawn by lot: what the votes alone are worth without their tie-break."""
+
+    uses_language: ClassVar[bool] = True
+    sends_all: ClassVar[bool] = False
+
+    def rank(self, context: ScoringContext) -> NumpyArray:
+        """All positions by falling votes, equal ones shuffled."""
+        return HardVoting(by_chance(context.rng)).rank(context)
+
+
+class TokenNorm:
+    """Tokens of the largest Euclidean norm first: importance without language."""
+
+    uses_language: ClassVar[bool] = False
+    sends_all: ClassVar[bool] = False
+
+    def rank(self, context: ScoringContext) -> NumpyArray:
+        """All positions by falling norm of the token as it crosses the link; ties by index."""
+        norms = np.linalg.norm(to_numpy(context.tokens, np.float64), axis=1)
+        return np.argsort(-norms, kind="stable").astype(np.int32)
 
 
 class RandomSelection:
@@ -205,30 +234,3 @@ class FullTransmission:
     def rank(self, context: ScoringContext) -> NumpyArray:
         """0 to N − 1."""
         return np.arange(context.tokens.shape[0], dtype=np.int32)
-
-
-SELECTORS: dict[str, type[Selector]] = {
-    "hard_voting": HardVoting,
-    "soft_voting": SoftVoting,
-    "random": RandomSelection,
-    "full": FullTransmission,
-}
-
-
-def make_selector(selector: str | Selector) -> Selector:
-    """A selector by name, or the given one unchanged.
-
-    Raises:
-        ValueError: no selector of that name.
-    """
-    if not isinstance(selector, str):
-        return selector
-    from comvla_client.pruners import PRUNERS  # it builds on this module
-
-    known: dict[str, Callable[[], Selector]] = {**SELECTORS, **PRUNERS}
-    if selector not in known:
-        raise ValueError(
-            f"expected a selector among {sorted(known)}, got {selector!r}: "
-            "pass one of these names, or an object with a rank(context) method"
-        )
-    return known[selector]()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+from typing import Literal, Protocol, TypeAlias
 
 from comvla import codec
 from comvla.model_info import ModelInfo
@@ -10,7 +10,53 @@ from comvla.v1.policy_pb2 import InferRequest
 from comvla_client.budget import LinkProfile, largest_that
 
 Budget: TypeAlias = "Literal['paper', 'framed'] | int"
-"""``"paper"``: Eq. (4). ``"framed"``: all bytes on the wire. A number: that many, whatever the SNR."""
+"""``"paper"``: Eq. (4). ``"framed"``: all bytes on the wire. A number: that many, whatever the SNR.
+
+Tokens for a form that sends tokens, bytes for one that sends pictures.
+"""
+
+
+class Sizer(Protocol):
+    """Turns bits into what an uplink form sends: tokens. Where it sends pictures, read bytes for tokens.
+
+    Attributes:
+        link: the radio link.
+        num_tokens: all that there could be: N tokens.
+        most_tokens: the most that a step may send: all, or a fixed budget.
+        min_tokens: fewer are not worth sending.
+        needs_snr: whether nothing can be sized without an SNR.
+        sends_all: whether everything is sent, whatever the link carries.
+    """
+
+    @property
+    def link(self) -> LinkProfile: ...
+
+    @property
+    def num_tokens(self) -> int: ...
+
+    @property
+    def most_tokens(self) -> int: ...
+
+    @property
+    def min_tokens(self) -> int: ...
+
+    @property
+    def needs_snr(self) -> bool: ...
+
+    @property
+    def sends_all(self) -> bool: ...
+
+    def tokens_in(
+        self, bits: float, request: InferRequest, *, progressive: bool, least: int, window_s: float
+    ) -> int:
+        """The tokens that ``bits`` carry, as ``budget`` counts; see :meth:`TokenSizer.tokens_in`."""
+        ...
+
+    def token_budgets(
+        self, bits: float, request: InferRequest, *, progressive: bool, least: int, window_s: float
+    ) -> tuple[int, int] | None:
+        """K* by Eq. (4) and by bytes on the wire, for the report; None where no tokens are sent."""
+        ...
 
 
 class TokenSizer:
@@ -62,6 +108,11 @@ class TokenSizer:
         self._budget = budget
 
     @property
+    def num_tokens(self) -> int:
+        """N."""
+        return self._info.num_tokens
+
+    @property
     def needs_snr(self) -> bool:
         """Whether nothing can be sized without an SNR."""
         return not (isinstance(self._budget, int) or self.sends_all)
@@ -93,6 +144,15 @@ class TokenSizer:
         return self.framed_tokens(
             bits, request, progressive=progressive, least=least, window_s=window_s
         )
+
+    def token_budgets(
+        self, bits: float, request: InferRequest, *, progressive: bool, least: int, window_s: float
+    ) -> tuple[int, int]:
+        """K* of Eq. (4), and by all bytes that cross the wire; arguments as in :meth:`tokens_in`."""
+        framed = self.framed_tokens(
+            bits, request, progressive=progressive, least=least, window_s=window_s
+        )
+        return self.paper_tokens(bits), framed
 
     def paper_tokens(self, bits: float) -> int:
         """Eq. (4): D · B bits for each token."""
@@ -135,3 +195,61 @@ class TokenSizer:
         return codec.encoded_bytes(
             k, self._info.token_dim, self._quantization, num_towers=len(self._info.tower_dims)
         )
+
+
+class ByteSizer:
+    """Turns bits into bytes of pictures, which a form of pictures has in place of tokens.
+
+    Args:
+        link: the radio link.
+        budget: ``"paper"`` counts the pictures' files, ``"framed"`` all bytes on the wire, a number fixes
+            the bytes of the files.
+        adjustable: whether the pictures' quality depends on what fits.
+
+    Raises:
+        ValueError: a budget that does not exist.
+    """
+
+    min_tokens = 1
+    sends_all = False
+    num_tokens = 2**31 - 1
+
+    def __init__(self, link: LinkProfile, budget: Budget, *, adjustable: bool) -> None:
+        is_count = isinstance(budget, int) and not isinstance(budget, bool) and budget >= 1
+        if not is_count and budget not in ("paper", "framed"):
+            raise ValueError(
+                "expected budget 'paper' (bytes of the pictures), 'framed' (bytes on the wire) or a "
+                f"number of bytes >= 1, got {budget!r}"
+            )
+        self.link = link
+        self.needs_snr = adjustable and not is_count
+        self._budget = budget
+
+    @property
+    def most_tokens(self) -> int:
+        """The most bytes that any step may send."""
+        return self._budget if isinstance(self._budget, int) else self.num_tokens
+
+    def tokens_in(
+        self, bits: float, request: InferRequest, *, progressive: bool, least: int, window_s: float
+    ) -> int:
+        """Bytes of pictures in so many bits; with ``"framed"`` bytes of the request's whole field."""
+        if isinstance(self._budget, int):
+            return self._budget
+        room_bytes = int(bits // 8)
+        if self._budget == "paper":
+            return room_bytes
+        rest = request.ByteSize()
+
+        def fits(length: int) -> bool:
+            field = codec.infer_request_bytes(
+                0, snr=False, snr_age=False, protocol_version=0, images_length=length
+            )
+            return codec.wire_bytes(rest + field) + codec.CALL_HEADERS_BYTES <= room_bytes
+
+        return largest_that(fits, room_bytes)
+
+    def token_budgets(
+        self, bits: float, request: InferRequest, *, progressive: bool, least: int, window_s: float
+    ) -> None:
+        """Pictures are no tokens."""

@@ -1,119 +1,160 @@
-"""From an observation to the bytes that cross the link: encode, score, select, quantise."""
+"""What goes up the link for one observation: the interface of all its forms.
+
+A form is told once who the robot is (:class:`Setup`), and then asked for each step what shall be
+sent (:meth:`UplinkForm.compress`), in as many tokens or bytes as its sizer made of what the link
+carries. Tokens by a selector are the product (:class:`comvla_client.token_uplink.TokenUplink`);
+coded pictures, which the cloud has to look at, are what everybody else sends
+(:class:`comvla_client.image_uplink.ImageUplink`). :mod:`comvla_client.registry` knows both by name.
+"""
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from comvla import codec
-from comvla_client.arrays import Array, to_numpy
+from comvla.model_info import ModelInfo
+from comvla.v1.policy_pb2 import CodedImages, GetModelResponse, InferRequest
+from comvla_client.budget import LinkProfile
 from comvla_client.edge import EdgeModel
 from comvla_client.observation import CheckedObservation
-from comvla_client.selection import ScoringContext, Selector
+from comvla_client.sizing import Budget, Sizer
+
+
+def _no_positions() -> npt.NDArray[np.int32]:
+    return np.zeros(0, dtype=np.int32)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a form is told about its robot, once.
+
+    Attributes:
+        info: the model that both sides run.
+        edge: the robot's half; None on a robot that has none.
+        link: the radio link.
+        quantization: how token values are coded.
+        budget: see :data:`comvla_client.sizing.Budget`.
+        min_tokens: fewest tokens worth sending.
+    """
+
+    info: ModelInfo
+    edge: EdgeModel | None
+    link: LinkProfile
+    quantization: str
+    budget: Budget
+    min_tokens: int
 
 
 @dataclass(frozen=True)
 class Uplink:
-    """Tokens ready to send.
+    """What one step sends, and what that cost. Exactly one of ``payload`` and ``images``, or neither.
 
     Attributes:
         payload: coded tokens, most important first.
-        positions: (K,) int32.
-        timings_s: seconds of the phases encode, project, score, select, quantize.
+        images: coded pictures.
+        positions: (K,) int32 of the tokens; empty for pictures.
+        payload_bytes: by the paper's accounting: K·D·B/8 for tokens, their files for pictures.
+        timings_s: seconds by phase, of :data:`comvla_client.report.PHASES`.
         flops: operations on the robot.
+        quality: of the pictures, where it was chosen.
+        refusal: why nothing is sent, where it is neither.
     """
 
-    payload: bytes
-    positions: npt.NDArray[np.int32]
-    timings_s: dict[str, float]
-    flops: float
+    payload: bytes = b""
+    images: CodedImages | None = None
+    positions: npt.NDArray[np.int32] = field(default_factory=_no_positions)
+    payload_bytes: int = 0
+    timings_s: dict[str, float] = field(default_factory=dict)
+    flops: float = 0.0
+    quality: int | None = None
+    refusal: str = ""
+
+    @property
+    def encoded_bytes(self) -> int:
+        """Length of what is sent with all that it needs to be read: positions and scales, or sizes."""
+        return len(self.payload) if self.images is None else self.images.ByteSize()
+
+    @property
+    def sends(self) -> bool:
+        """Whether there is anything to send."""
+        return bool(self.payload) or self.images is not None
+
+    def fill(self, request: InferRequest) -> None:
+        """Puts it into a request that holds everything else."""
+        if self.images is None:
+            request.payload = self.payload
+        else:
+            request.images.CopyFrom(self.images)
 
 
-class TokenUplink:
-    """The edge half of one step (Algorithm 1 after the link budget is known).
+class UplinkForm(Protocol):
+    """A way of telling the cloud what the robot sees. One object serves one client.
 
-    Args:
-        edge: the robot's half of the model.
-        selector: who ranks the tokens.
-        quantization: how values are coded, a name of :data:`comvla.codec.QUANTIZATIONS`.
+    Attributes:
+        name: for reports and tables.
+        needs_edge: whether the robot needs its half of the model, and with it torch.
+        in_pieces: whether a part of what it sends is of use.
+        sizer: what so many bits carry, from :meth:`start` on.
     """
 
-    def __init__(self, edge: EdgeModel, selector: Selector, quantization: str) -> None:
-        self._edge = edge
-        self._selector = selector
-        self._quantization = quantization
-        self._instruction: str | None = None
-        self._queries: Array | None = None
+    @property
+    def name(self) -> str: ...
 
-    def queries(self, instruction: str) -> Array:
-        """Language queries (Q, d), computed when the instruction changes.
+    @property
+    def needs_edge(self) -> bool: ...
+
+    @property
+    def in_pieces(self) -> bool: ...
+
+    @property
+    def sizer(self) -> Sizer: ...
+
+    def start(self, setup: Setup) -> None:
+        """Learns who the robot is, before anything else.
 
         Raises:
-            InstructionError: the model cannot read it.
+            ValueError: an option that this form cannot work with.
         """
-        if self._queries is None or instruction != self._instruction:
-            self._queries = self._edge.text_queries(instruction)
-            self._instruction = instruction
-        return self._queries
+        ...
 
-    def reset(self) -> None:
-        """Begins a new episode, for selectors with a memory."""
-        forget = getattr(self._selector, "reset", None)
-        if forget is not None:
-            forget()
+    def check_server(self, response: GetModelResponse) -> None:
+        """Compares what the server reads with what this form sends.
 
-    def compress(
-        self, obs: CheckedObservation, queries: Array, count: int, rng: np.random.Generator
-    ) -> Uplink:
-        """Encodes an observation and keeps the ``count`` most important tokens.
+        Raises:
+            HandshakeError: the server would refuse it; with the remedy.
+        """
+        ...
+
+    def hear(self, instruction: str) -> None:
+        """Takes note of the instruction, before the observation.
+
+        Raises:
+            InstructionError: this form works with words, and cannot read these.
+        """
+        ...
+
+    def compress(self, obs: CheckedObservation, count: int, rng: np.random.Generator) -> Uplink:
+        """What to send for an observation.
 
         Args:
             obs: a checked observation.
-            queries: (Q, d) language queries.
-            count: K, 1 to N; a selector that ranks fewer sends fewer.
-            rng: for selectors that draw.
+            count: the most that it may be, tokens or bytes; at least 1.
+            rng: for forms that draw.
         """
-        info, timings_s = self._edge.info, {}
-        watch = _Stopwatch()
-        if getattr(self._edge, "sees_instruction", False):
-            tokens = self._edge.encode(obs.images, self._instruction)  # type: ignore[call-arg]
-        else:
-            tokens = self._edge.encode(obs.images)
-        timings_s["encode"] = watch.lap()
-        uses_language = self._selector.uses_language
-        projected = self._edge.project(tokens) if uses_language else None
-        timings_s["project"] = watch.lap()
-        context = ScoringContext(
-            tokens,
-            projected,
-            queries,
-            info.grid,
-            rng,
-            edge=self._edge,
-            instruction=self._instruction,
-            proprio=obs.proprio,
-        )
-        ranking = self._selector.rank(context)
-        timings_s["score"] = watch.lap()
-        positions = np.ascontiguousarray(ranking[:count], dtype=np.int32)
-        kept = to_numpy(tokens[positions], np.float32)
-        timings_s["select"] = watch.lap()
-        payload = codec.encode(kept, positions, self._quantization, tower_dims=info.tower_dims)
-        timings_s["quantize"] = watch.lap()
-        flops = float(self._edge.flops(queries.shape[0] if uses_language else 0))
-        return Uplink(payload, positions, timings_s, flops)
+        ...
 
+    def settle(self, step: int, answered: bool) -> None:
+        """Learns what became of the step that was compressed last.
 
-class _Stopwatch:
-    """Seconds since the last lap on the monotonic clock."""
+        Args:
+            step: its number in the session.
+            answered: whether the server answered, so that it surely has what was sent.
+        """
+        ...
 
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-
-    def lap(self) -> float:
-        now = time.perf_counter()
-        elapsed, self._last = now - self._last, now
-        return elapsed
+    def reset(self) -> None:
+        """Begins a new episode."""
+        ...

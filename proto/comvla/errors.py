@@ -9,7 +9,11 @@ class ComVLAError(Exception):
 
 
 class CodecError(ComVLAError, ValueError):
-    """A payload that is not what the token codec writes."""
+    """A payload that is not what the token codec writes, or a picture that is not what its coding writes."""
+
+
+class KeyFrameNeededError(ComVLAError):
+    """A picture that builds on one which is not held here: the next has to be a key frame."""
 
 
 class CheckpointError(ComVLAError):

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 
 from comvla.codec import MAX_TOWERS
 from comvla.errors import HandshakeError
+from comvla.images import coding_name, coding_number
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1 import policy_pb2
 
@@ -41,6 +42,7 @@ def to_response(
     quantizations: Sequence[str],
     max_request_bytes: int,
     server_version: str,
+    image_codings: Sequence[str] = (),
     progressive: bool = False,
 ) -> policy_pb2.GetModelResponse:
     """The server's answer to ``GetModel``.
@@ -50,10 +52,12 @@ def to_response(
         quantizations: names of :data:`comvla.codec.QUANTIZATIONS` that it reads.
         max_request_bytes: largest ``InferRequest`` that it reads.
         server_version: release, for people.
+        image_codings: names of :data:`comvla.images.IMAGE_CODINGS` that it reads; none where the
+            robot has to see for itself.
         progressive: whether it answers ``InferProgressive``.
 
     Raises:
-        ValueError: a quantization that the protocol does not know.
+        ValueError: a quantization or picture coding that the protocol does not know.
     """
     return policy_pb2.GetModelResponse(
         protocol_version=PROTOCOL_VERSION,
@@ -73,6 +77,7 @@ def to_response(
         max_request_bytes=max_request_bytes,
         server_version=server_version,
         image_size=info.image_size,
+        image_codings=[coding_number(name) for name in image_codings],
         progressive=progressive,
     )
 
@@ -153,6 +158,12 @@ def offered_quantizations(response: policy_pb2.GetModelResponse) -> tuple[str, .
     )
 
 
+def offered_image_codings(response: policy_pb2.GetModelResponse) -> tuple[str, ...]:
+    """Names of the picture codings that the server reads; those newer than this side are left out."""
+    names = (coding_name(number) for number in response.image_codings)
+    return tuple(name for name in names if name is not None)
+
+
 def mismatch(edge: ModelInfo, cloud: ModelInfo) -> str | None:
     """The first difference between the robot's half and the server's, in words with a remedy.
 
@@ -186,6 +197,22 @@ def quantization_mismatch(wanted: str, offered: Iterable[str]) -> str | None:
     return (
         f"server reads quantization {', '.join(names) or 'none known here'}, client sends "
         f"{wanted}: choose one that the server reads"
+    )
+
+
+def image_coding_mismatch(wanted: str, offered: Iterable[str]) -> str | None:
+    """Whether the server reads the pictures that the robot wants to send; in words if not."""
+    names = tuple(offered)
+    if wanted in names:
+        return None
+    if not names:
+        return (
+            f"client sends {wanted} pictures, server has no vision half and reads tokens only: start "
+            "it with comvla-server serve --vision on, or give the robot an edge model"
+        )
+    return (
+        f"server reads pictures as {', '.join(names)}, client sends {wanted}: choose one that the "
+        "server reads, or install what it lacks there (pillow for jpeg, webp and avif, av for h264)"
     )
 
 

@@ -36,6 +36,7 @@ class ModelDescription(BaseModel):
     max_prompt_tokens: int
     control_period_s: float
     quantizations: list[str]
+    image_codings: list[str]
     max_request_bytes: int
     max_batch: int
 
@@ -143,6 +144,7 @@ def _describe_model(runtime: Runtime, settings: ServerSettings) -> ModelDescript
         max_prompt_tokens=info.max_prompt_tokens,
         control_period_s=info.control_period_s,
         quantizations=list(codec.QUANTIZATIONS),
+        image_codings=list(runtime.engine.image_codings),
         max_request_bytes=settings.max_request_bytes,
         max_batch=settings.max_batch,
     )

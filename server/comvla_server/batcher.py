@@ -19,7 +19,7 @@ from comvla_server.passes import Pass, run_pass
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.sessions import Session, SessionTable, superseded
 from comvla_server.tickets import Answer, Ticket
-from comvla_vla.request import PolicyRequest
+from comvla_vla.request import AnyRequest
 
 
 class Batcher:
@@ -99,7 +99,7 @@ class Batcher:
         session = self._sessions.get(session_id, self._clock())
         return session.find(step, digest) if session else None
 
-    def admit(self, session_id: str, step: int, request: PolicyRequest, digest: bytes) -> Ticket:
+    def admit(self, session_id: str, step: int, request: AnyRequest, digest: bytes) -> Ticket:
         """Puts a new step into the queue; an older one of the session that waits is superseded.
 
         Raises:
@@ -153,7 +153,7 @@ class Batcher:
         self,
         session_id: str,
         step: int,
-        request: PolicyRequest,
+        request: AnyRequest,
         deadline_s: float,
         digest: bytes = b"",
     ) -> Answer:
@@ -242,7 +242,7 @@ class Batcher:
             return
         answer = Answer(
             actions=outcome.result,
-            tokens_used=len(ticket.request.positions),
+            tokens_used=self._engine.num_tokens(ticket.request),
             batch_size=outcome.batch_size,
             cloud_flops=outcome.flops,
             queue_s=started_s - ticket.admitted_s,

@@ -8,8 +8,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from comvla import handshake
+from comvla.errors import HandshakeError
 from comvla.model_info import ModelInfo
-from comvla_vla.request import PolicyRequest
+from comvla_server.vision import Vision
+from comvla_vla.request import AnyRequest, ImageRequest, PolicyRequest
 
 # Id 1 begins a sequence in every vocabulary that this project builds or loads.
 _BOS_ID = 1
@@ -39,16 +42,34 @@ class ModelOutputError(RuntimeError):
 class Engine:
     """Runs the cloud half and vouches for what comes out of it.
 
+    Args:
+        cloud: the cloud half.
+        vision: the vision half of the same model, for robots that send pictures; None reads tokens only.
+
     Attributes:
         info: description of the model.
+        vision: as given.
+
+    Raises:
+        HandshakeError: vision and cloud half are of different models.
     """
 
-    def __init__(self, cloud: CloudHalf) -> None:
+    def __init__(self, cloud: CloudHalf, vision: Vision | None = None) -> None:
         self._cloud = cloud
         self.info = cloud.info
+        self.vision = vision
+        if vision is not None:
+            difference = handshake.mismatch(vision.info, cloud.info)
+            if difference is not None:
+                raise HandshakeError(f"vision and cloud half are of different models: {difference}")
 
-    def predict(self, requests: Sequence[PolicyRequest]) -> list[NDArray[np.float32]]:
-        """Actions for a batch of requests, whose numbers of tokens may differ.
+    @property
+    def image_codings(self) -> tuple[str, ...]:
+        """Picture codings that are read."""
+        return () if self.vision is None else tuple(self.vision.decoders)
+
+    def predict(self, requests: Sequence[AnyRequest]) -> list[NDArray[np.float32]]:
+        """Actions for a batch of requests, whose numbers of tokens may differ; pictures are looked at first.
 
         Args:
             requests: at least one.
@@ -59,7 +80,7 @@ class Engine:
         Raises:
             ModelOutputError: wrong number of chunks, a wrong shape, or a value that is not finite.
         """
-        chunks = self._cloud.predict(list(requests))
+        chunks = self._cloud.predict([self._seen(request) for request in requests])
         if len(chunks) != len(requests):
             raise ModelOutputError(
                 f"the model answered {len(chunks)} chunks to {len(requests)} requests"
@@ -75,9 +96,18 @@ class Engine:
                 raise ModelOutputError("the model answered actions that are not finite")
         return actions
 
-    def flops(self, request: PolicyRequest) -> float:
-        """Multiply-adds counted twice that this request costs in the cloud half."""
-        return float(self._cloud.flops(len(request.positions), request.instruction))
+    def num_tokens(self, request: AnyRequest) -> int:
+        """Visual tokens that the backbone gets for this request: those that came, or all of a picture's."""
+        if isinstance(request, ImageRequest):
+            return self.info.num_tokens
+        return len(request.positions)
+
+    def flops(self, request: AnyRequest) -> float:
+        """Multiply-adds counted twice that this request costs here: vision too where pictures came."""
+        seen = 0.0
+        if isinstance(request, ImageRequest) and self.vision is not None:
+            seen = float(self.vision.flops(request))
+        return seen + float(self._cloud.flops(self.num_tokens(request), request.instruction))
 
     def check_instruction(self, instruction: str) -> None:
         """Asks the model's own prompt code.
@@ -95,6 +125,26 @@ class Engine:
         """
         for size in sorted({1, max_batch}):
             self.predict([self.blank_request(self.info.num_tokens)] * size)
+            if self.vision is not None:
+                self.predict([self._blank_pictures()] * size)
+
+    def _seen(self, request: AnyRequest) -> PolicyRequest:
+        """All tokens of a request's pictures; one that brings tokens as it is."""
+        if not isinstance(request, ImageRequest):
+            return request
+        if self.vision is None:
+            raise ModelOutputError("pictures came, and there is no vision half to look at them")
+        return PolicyRequest(
+            tokens=self.vision.encode(request.images, request.instruction),
+            positions=np.arange(self.info.num_tokens, dtype=np.int32),
+            instruction=request.instruction,
+            proprio=request.proprio,
+        )
+
+    def _blank_pictures(self) -> ImageRequest:
+        blank, info = self.blank_request(1), self.info
+        images = [np.zeros((*info.image_size, 3), np.uint8)] * info.grid[0]
+        return ImageRequest(images, blank.instruction, blank.proprio)
 
     def blank_request(self, num_tokens: int, prompt_tokens: int = 16) -> PolicyRequest:
         """A request of the right shapes without meaning, for warm-up and cost.

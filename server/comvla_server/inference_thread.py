@@ -18,11 +18,14 @@ class InferenceThread:
 
     It is a daemon, unlike the threads of :class:`concurrent.futures.ThreadPoolExecutor`: a model
     that hangs must not keep a process alive that was told to stop.
+
+    Args:
+        name: of the thread, for people who look at a stuck process.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "comvla-inference") -> None:
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, name="comvla-inference", daemon=True)
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
 
     async def run(self, function: Callable[..., _T], *args: object) -> _T:

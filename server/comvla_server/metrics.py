@@ -25,19 +25,24 @@ class Metrics:
 
     TX is the robot's transmission, seen from the server: counted for every call that arrived,
     repeats and refused calls included, because they crossed the link too. Three sizes that must not
-    be confused: ``payload`` is the paper's accounting K·D·B/8, ``encoded`` the bytes of the payload
-    field, ``framed`` the whole message with protobuf, gRPC and HTTP/2 framing.
+    be confused: ``payload`` is the paper's accounting K·D·B/8, or the files of coded pictures; ``encoded``
+    the bytes of the payload or images field, ``framed`` the whole message with protobuf, gRPC and HTTP/2
+    framing.
     """
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
         self.tx_payload_bytes = self._counter(
-            "comvla_tx_payload_bytes", "Token bits received, paper accounting K*D*B/8, in bytes."
+            "comvla_tx_payload_bytes",
+            "Paper accounting in bytes: token bits K*D*B/8, or the files of coded pictures.",
+        )
+        self.tx_image_bytes = self._counter(
+            "comvla_tx_image_bytes", "Files of coded pictures received, in bytes."
         )
         self.tx_encoded_bytes = self._counter(
             "comvla_tx_encoded_bytes",
-            "Bytes of the payload fields received (scales and positions).",
+            "Bytes of the payload fields received (scales and positions), or of the images fields.",
         )
         self.tx_framed_bytes = self._counter(
             "comvla_tx_framed_bytes", "Bytes of requests with protobuf, gRPC and HTTP/2 framing."
@@ -50,7 +55,7 @@ class Metrics:
         )
         self.inference_flops = self._counter(
             "comvla_inference_flops",
-            "Multiply-adds counted twice, spent in the cloud half on answers.",
+            "Multiply-adds counted twice, spent on answers.",
         )
         self.inference_busy_seconds = self._counter(
             "comvla_inference_busy_seconds", "Time that the inference thread spent in the model."

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from comvla_server.engine import Engine
 from comvla_server.metrics import Metrics
-from comvla_vla.request import PolicyRequest
+from comvla_vla.request import AnyRequest
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ class Pass:
 
 def run_pass(
     engine: Engine,
-    requests: Sequence[PolicyRequest],
+    requests: Sequence[AnyRequest],
     metrics: Metrics,
     clock: Callable[[], float],
 ) -> list[Pass]:

@@ -18,6 +18,7 @@ class Reason(str, Enum):
     OVERSIZE = "oversize"  # message larger than the cap
     OVERLOAD = "overload"  # queue full, or too many bytes in flight
     SHORT = "short"  # too few tokens of a payload in pieces arrived within its window
+    KEY_FRAME = "key_frame"  # a picture that builds on one which is not held here
     SUPERSEDED = "superseded"  # a newer observation of the session came
     DEADLINE = "deadline"  # too late to be of use
     CANCELLED = "cancelled"  # the robot hung up

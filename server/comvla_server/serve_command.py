@@ -60,12 +60,15 @@ def run(args: argparse.Namespace) -> int:
 def load_engine(settings: ServerSettings) -> Engine:
     """The cloud half of the checkpoint that the settings name, ready to run.
 
+    With the vision half where that is wanted.
+
     Raises:
         CheckpointError: missing, damaged, foreign or incomplete.
     """
     import torch
 
     from comvla_server.engine import Engine
+    from comvla_server.vision import holds_whole, load_vision
     from comvla_vla import CloudOptions, FastV, load_cloud
 
     if settings.threads is not None:
@@ -75,15 +78,20 @@ def load_engine(settings: ServerSettings) -> Engine:
         compact_positions=settings.compact_positions,
         compile=settings.compile,
     )
-    return Engine(
-        load_cloud(
-            settings.model,
-            device=settings.device,
-            dtype=getattr(torch, settings.dtype),
-            statistics_key=settings.statistics_key,
-            options=options,
-        )
+    cloud = load_cloud(
+        settings.model,
+        device=settings.device,
+        dtype=getattr(torch, settings.dtype),
+        statistics_key=settings.statistics_key,
+        options=options,
     )
+    wanted = settings.vision == "on" or (settings.vision == "auto" and holds_whole(settings.model))
+    if not wanted:
+        return Engine(cloud)
+    vision = load_vision(
+        settings.model, cloud, settings.device, statistics_key=settings.statistics_key
+    )
+    return Engine(cloud, vision)
 
 
 async def _serve(settings: ServerSettings, load: Callable[[], Engine]) -> int:

@@ -15,6 +15,7 @@ from comvla_server.access import Access
 from comvla_server.admin import create_app
 from comvla_server.admin_http import AdminHttp
 from comvla_server.batcher import Batcher
+from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
 from comvla_server.inference_thread import InferenceThread
@@ -67,6 +68,7 @@ class Server:
         self._access: Access | None = None
         self._watching: asyncio.Task[None] | None = None
         self._thread: InferenceThread | None = None
+        self._decode_thread: InferenceThread | None = None
 
     @property
     def target(self) -> str:
@@ -161,7 +163,9 @@ class Server:
             sessions=lambda: len(batcher.sessions),
         )
         validator = Validator(engine, settings.max_request_bytes)
-        self._service.runtime = Runtime(engine, batcher, validator)
+        self._decode_thread = InferenceThread("comvla-decode")
+        decoding = Decoding(self._decode_thread, settings.max_queue)
+        self._service.runtime = Runtime(engine, batcher, validator, decoding)
         self.lifecycle.enter(Phase.SERVING)
         await self._health.serving()
         _log.info("serving %s", engine.info.name, extra={"grpc": self.target})
@@ -192,6 +196,8 @@ class Server:
             self._watching.cancel()
         if self._thread is not None:
             self._thread.close(timeout_s=1.0 if finished else 0.0)
+        if self._decode_thread is not None:
+            self._decode_thread.close(timeout_s=1.0 if finished else 0.0)
         self.lifecycle.enter(Phase.STOPPED)
         return finished
 

@@ -6,15 +6,18 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import grpc
 
 from comvla import codec, handshake
 from comvla.errors import CodecError
+from comvla.images import MAX_VIEW_PIXELS, picture_bytes
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.accounts import Answered, CallAccounts
 from comvla_server.batcher import Batcher
+from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.memory import BytesInFlight, Lease
@@ -25,6 +28,7 @@ from comvla_server.settings import ServerSettings
 from comvla_server.tickets import Answer
 from comvla_server.validation import Validator, content_digest
 from comvla_server.version import server_version
+from comvla_vla.request import AnyRequest
 
 STATUS = {
     Reason.MALFORMED: grpc.StatusCode.INVALID_ARGUMENT,
@@ -34,6 +38,7 @@ STATUS = {
     Reason.OVERSIZE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.OVERLOAD: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.SHORT: grpc.StatusCode.DEADLINE_EXCEEDED,
+    Reason.KEY_FRAME: grpc.StatusCode.ABORTED,
     Reason.SUPERSEDED: grpc.StatusCode.ABORTED,
     Reason.DEADLINE: grpc.StatusCode.DEADLINE_EXCEEDED,
     Reason.CANCELLED: grpc.StatusCode.CANCELLED,
@@ -54,6 +59,7 @@ class Runtime:
     engine: Engine
     batcher: Batcher
     validator: Validator
+    decoding: Decoding
 
 
 class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
@@ -104,6 +110,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             max_request_bytes=self._settings.max_request_bytes,
             server_version=server_version(),
             progressive=True,
+            image_codings=runtime.engine.image_codings,
         )
 
     async def Infer(
@@ -140,7 +147,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
         async def work(started_s: float, deadline_s: float) -> Answered:
             self._count_message(request.ByteSize())
-            self._count_payload(request.payload)
+            self._count_content(request)
             with self._in_flight.lease() as lease:
                 lease.take(request.ByteSize())
                 return await self._answer(request, lease, started_s, deadline_s)
@@ -240,15 +247,20 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             digest = content_digest(request)
         batcher = runtime.batcher
         ticket = batcher.find(request.session_id, request.step, digest)
-        repeat = ticket is not None
-        on_record = ticket is not None and ticket.outcome.done()
         decode_s = 0.0
+        policy_request: AnyRequest | None = None
         if ticket is None:
             decode_began_s = self._clock()
-            lease.take(_decoded_bytes(request.payload))
-            policy_request = runtime.validator.read(request)
+            lease.take(_decoded_bytes(request))
+            policy_request = await self._read(runtime, request, deadline_s)
             decode_s = self._clock() - decode_began_s
             self._metrics.step_phase.labels("decode").observe(decode_s)
+            # While pictures were decoded, a repeat of this step or a newer one may have come.
+            ticket = batcher.find(request.session_id, request.step, digest)
+        repeat = ticket is not None
+        on_record = ticket is not None and ticket.outcome.done()
+        if ticket is None:
+            assert policy_request is not None
             ticket = batcher.admit(request.session_id, request.step, policy_request, digest)
         answer = await batcher.wait(ticket, deadline_s)
         response = self._response(request, runtime, answer)
@@ -258,6 +270,15 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             response.timings.predict_s = answer.predict_s
         response.timings.total_s = self._clock() - started_s
         return response, repeat
+
+    async def _read(
+        self, runtime: Runtime, request: policy_pb2.InferRequest, deadline_s: float
+    ) -> AnyRequest:
+        """Tokens here and now, which takes microseconds; pictures in their own thread."""
+        read = partial(runtime.validator.read, request)
+        if request.HasField("images"):
+            return await runtime.decoding.run(read, deadline_s)
+        return read()
 
     def _response(
         self, request: policy_pb2.InferRequest, runtime: Runtime, answer: Answer
@@ -282,6 +303,13 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         """What crossed the link, whatever becomes of it."""
         self._metrics.tx_framed_bytes.inc(codec.wire_bytes(size_bytes))
 
+    def _count_content(self, request: policy_pb2.InferRequest) -> None:
+        self._count_payload(request.payload)
+        if request.HasField("images"):
+            self._metrics.tx_encoded_bytes.inc(request.images.ByteSize())
+            self._metrics.tx_image_bytes.inc(picture_bytes(request.images))
+            self._metrics.tx_payload_bytes.inc(picture_bytes(request.images))
+
     def _count_payload(self, payload: bytes | bytearray) -> None:
         metrics = self._metrics
         metrics.tx_encoded_bytes.inc(len(payload))
@@ -303,10 +331,11 @@ def _whole_tokens(header: codec.PayloadHeader, length: int) -> int:
     return min(arrived, header.count)
 
 
-def _decoded_bytes(payload: bytes) -> int:
-    """What the tokens of a payload take as float32; 0 where it is none."""
+def _decoded_bytes(request: policy_pb2.InferRequest) -> int:
+    """What tokens take as float32, and what pictures that may be decoded take."""
+    pixels = sum(min(v.height * v.width, MAX_VIEW_PIXELS) for v in request.images.views)
     try:
-        header = codec.read_header(payload)
+        header = codec.read_header(request.payload)
     except CodecError:
-        return 0
-    return 4 * _whole_tokens(header, len(payload)) * header.token_dim
+        return 3 * pixels
+    return 3 * pixels + 4 * _whole_tokens(header, len(request.payload)) * header.token_dim

@@ -54,6 +54,13 @@ class ServerSettings:
         MODEL,
         metavar="KEY",
     )
+    vision: str = setting(
+        "auto",
+        "also load the vision half, for robots that send pictures; auto: where the checkpoint on this "
+        "machine is whole. It takes the memory of the towers, which the log names",
+        MODEL,
+        choices=("auto", "on", "off"),
+    )
     fastv: tuple[int, float] | None = setting(
         None,
         "drop this share of the visual tokens before this layer, e.g. 3,0.75: saves operations, not bytes",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from comvla_server.refusals import Refusal
-from comvla_vla.request import PolicyRequest
+from comvla_vla.request import AnyRequest
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Answer:
 
     Attributes:
         actions: (H, A) float32.
-        tokens_used: K.
+        tokens_used: K; N where pictures came.
         batch_size: requests that shared the forward pass.
         cloud_flops: multiply-adds counted twice, this request's share.
         queue_s: seconds between admission and the start of the forward pass.
@@ -53,14 +53,14 @@ class Ticket:
     session_id: str
     step: int
     digest: bytes
-    request: PolicyRequest | None
+    request: AnyRequest | None
     admitted_s: float
     outcome: asyncio.Future[Outcome]
     deadline_s: float = 0.0
     callers: int = field(default=0)
 
     def resolve(self, outcome: Outcome) -> None:
-        """Settles the ticket once and lets go of the tokens."""
+        """Settles the ticket once and lets go of the tokens or pictures."""
         self.request = None
         if not self.outcome.done():
             self.outcome.set_result(outcome)

@@ -15,10 +15,11 @@ from comvla import codec
 from comvla.errors import CodecError, InstructionError
 from comvla.model_info import PROTOCOL_VERSION
 from comvla.v1 import policy_pb2
+from comvla_server.decoding import read_pictures
 from comvla_server.engine import Engine
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.wording import shown
-from comvla_vla.request import PolicyRequest
+from comvla_vla.request import AnyRequest, ImageRequest, PolicyRequest
 
 MAX_SESSION_ID_CHARS = 128
 MAX_INSTRUCTION_CHARS = 2000
@@ -88,18 +89,23 @@ class Validator:
         self._check_instruction(request.instruction)
         self._proprio(request)
 
-    def read(self, request: policy_pb2.InferRequest) -> PolicyRequest:
-        """Checks the content and decodes the tokens.
+    def read(self, request: policy_pb2.InferRequest) -> AnyRequest:
+        """Checks the content and decodes tokens or pictures.
+
+        Pictures take milliseconds to decode: call it off the event loop where ``images`` is set.
 
         Returns:
-            What the model needs: tokens (K, D) float32, 1 <= K <= N; positions (K,) int32.
+            What the model needs: tokens (K, D) float32, 1 <= K <= N, and positions (K,) int32; or pictures.
 
         Raises:
-            Refusal: invalid.
+            Refusal: invalid; for pictures also mismatch or key frame.
         """
         self._check_link_report(request)
         self._check_instruction(request.instruction)
         proprio = self._proprio(request)
+        if request.HasField("images"):
+            pictures = read_pictures(request, self.engine.info, self.engine.vision)
+            return ImageRequest(pictures, request.instruction, proprio)
         tokens, positions = self._tokens(request.payload)
         return PolicyRequest(tokens, positions, request.instruction, proprio)
 
@@ -173,6 +179,8 @@ def content_digest(request: policy_pb2.InferRequest) -> bytes:
     digest.update(text)
     digest.update(np.asarray(request.proprio, dtype="<f4").tobytes())
     digest.update(request.payload)
+    if request.HasField("images"):
+        digest.update(request.images.SerializeToString(deterministic=True))
     return digest.digest()
 
 

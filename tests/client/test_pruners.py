@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from comvla.errors import ObservationError
 from comvla_client.pruners import VLAADP, LightVLA, MotionGate, view_quotas
-from comvla_client.selection import ScoringContext, make_selector
+from comvla_client.registry import make_selector
+from comvla_client.selection import ScoringContext
 
 
 def context(**edge: Any) -> ScoringContext:

@@ -12,14 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from comvla_client import ComVLAClient
+from comvla_client.registry import SELECTORS, make_selector
 from comvla_client.scoring import Importance, hard_votes, soft_votes
 from comvla_client.selection import (
-    SELECTORS,
     HardVoting,
     ScoringContext,
     by_chance,
     by_index,
-    make_selector,
     select,
 )
 
@@ -90,7 +89,7 @@ def context(seed: int = 0, kind: Any = np.asarray) -> ScoringContext:
     )
 
 
-@pytest.mark.parametrize("name", sorted(SELECTORS))
+@pytest.mark.parametrize("name", sorted({*SELECTORS} - {"lightvla", "vla_adp"}))
 @pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
 def test_every_selector_ranks_every_token_once(name: str, kind: Any) -> None:
     ranking = make_selector(name).rank(context(kind=kind))

@@ -11,8 +11,8 @@ import pytest
 
 from comvla.codec import payload_bytes
 from comvla_client import LinkProfile, token_budget
+from comvla_client.registry import IMAGE_FORMS, SELECTORS
 from comvla_client.report import StepReport
-from comvla_client.selection import SELECTORS
 from comvla_client.snr import __all__ as SNR_NAMES
 from comvla_server.metrics import Metrics
 from comvla_server.service import STATUS
@@ -21,6 +21,7 @@ from comvla_server.settings import ServerSettings
 
 README = markdown.ROOT / "README.md"
 SERVER = markdown.ROOT / "docs" / "server.md"
+SELECTOR_GUIDE = markdown.ROOT / "docs" / "selectors.md"
 EDGE = markdown.ROOT / "docs" / "edge-sdk.md"
 
 
@@ -77,8 +78,8 @@ def test_the_server_guide_explains_every_status_that_a_robot_can_see() -> None:
 
 
 def test_the_edge_guide_names_every_selector_and_every_field_of_the_report() -> None:
-    selectors = {row[0].strip('`"') for row in markdown.table(EDGE, "`selector=`")}
-    assert selectors == set(SELECTORS)
+    rows = markdown.table(EDGE, "`selector=`")
+    assert {name for row in rows for name in re.findall(r'"(\w+)"', row[0])} == set(SELECTORS)
     named = {
         name for row in markdown.table(EDGE, "fields") for name in re.findall(r"`(\w+)`", row[0])
     }
@@ -89,3 +90,12 @@ def test_the_edge_guide_names_every_snr_source() -> None:
     rows = markdown.table(EDGE, "source")
     named = {name for row in rows for name in re.findall(r"`(\w+Snr)\(", row[0])}
     assert named == {name for name in SNR_NAMES if name.endswith("Snr")}
+
+
+def test_the_guide_of_selectors_says_what_their_table_says() -> None:
+    rows = markdown.table(SELECTOR_GUIDE, "name | equation")
+    assert {row[0].strip("`"): row[2] for row in rows} == {
+        name: entry.source for name, entry in SELECTORS.items()
+    }
+    named = " ".join(row[0] for row in markdown.table(SELECTOR_GUIDE, "name | | |"))
+    assert set(re.findall(r"`(\w+)-", named)) == set(IMAGE_FORMS)

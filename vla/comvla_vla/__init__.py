@@ -14,19 +14,22 @@ from comvla_vla.checkpoints import (
 from comvla_vla.cloud import CloudModel
 from comvla_vla.config import ModelConfig
 from comvla_vla.edge import EdgeModel
+from comvla_vla.lending import lend_pruners
 from comvla_vla.options import CloudOptions, FastV
 from comvla_vla.random import random_policy
-from comvla_vla.request import PolicyRequest
+from comvla_vla.request import ImageRequest, PolicyRequest
 
 __all__ = [
     "CloudModel",
     "CloudOptions",
     "EdgeModel",
     "FastV",
+    "ImageRequest",
     "ModelConfig",
     "PolicyRequest",
     "Recipe",
     "check_split",
+    "lend_pruners",
     "load_cloud",
     "load_edge",
     "random_policy",

@@ -48,6 +48,10 @@ class CloudModel:
         if self.options.compile:
             net.backbone.compile_rows()
 
+    def with_options(self, options: CloudOptions) -> CloudModel:
+        """The same weights run another way; both may be used."""
+        return CloudModel(self.net, self.prompt, self.statistics, self.info, options)
+
     def check_instruction(self, instruction: str) -> None:
         """Raises InstructionError where :meth:`predict` would."""
         self.prompt.ids(instruction)

@@ -12,7 +12,7 @@ from torch import Tensor
 from comvla.errors import CheckpointError, InstructionError, ObservationError
 from comvla.model_info import ModelInfo
 from comvla_vla.config import ModelConfig
-from comvla_vla.flops import edge_flops
+from comvla_vla.flops import edge_flops, vision_flops
 from comvla_vla.nets import EdgeNet
 from comvla_vla.preprocess import preprocess
 from comvla_vla.prompt import Prompt
@@ -139,6 +139,10 @@ class EdgeModel:
     def flops(self, num_queries: int = 0) -> int:
         """Operations of one step on the robot: vision, projection, and votes of ``num_queries`` queries."""
         return edge_flops(self.config, num_queries)
+
+    def vision_flops(self) -> int:
+        """Operations of :meth:`encode` alone: the towers over all views."""
+        return vision_flops(self.config)
 
     def _words(self, instruction: str | Sequence[int]) -> Tensor:
         """Embedded prompt with begin-of-sequence and stop (T + 1, d)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,3 +26,22 @@ class PolicyRequest:
     positions: NDArray[np.integer] | Tensor
     instruction: str | Sequence[int]
     proprio: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class ImageRequest:
+    """One observation of a robot that lets the cloud see.
+
+    Attributes:
+        images: uint8 (H, W, 3) RGB, one per view in the model's order.
+        instruction: as in :class:`PolicyRequest`.
+        proprio: as in :class:`PolicyRequest`.
+    """
+
+    images: Sequence[NDArray[np.uint8]]
+    instruction: str | Sequence[int]
+    proprio: NDArray[np.float32] | None = None
+
+
+AnyRequest: TypeAlias = PolicyRequest | ImageRequest
+"""What a server may be asked: to finish a forward pass, or to do it all."""

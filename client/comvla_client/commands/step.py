@@ -22,8 +22,8 @@ from comvla_client.commands.arguments import (
     tls_of,
 )
 from comvla_client.commands.snr_arguments import add_snr_source, opened
+from comvla_client.registry import IMAGE_FORMS, table
 from comvla_client.report import ActionChunk
-from comvla_client.selection import SELECTORS
 from comvla_client.sending import POLICIES
 
 _DESCRIPTION = """\
@@ -40,6 +40,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
         "step",
         help="send one observation and print the report",
         description=_DESCRIPTION,
+        epilog=f"selectors, and picture codings for --uplink:\n{table()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_target(parser)
@@ -71,11 +72,18 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--selector",
-        choices=sorted(SELECTORS),
+        metavar="NAME",
         default="hard_voting",
-        help="who ranks the tokens (default: %(default)s)",
+        help="who ranks the tokens, a name below or module:ClassName (default: %(default)s)",
     )
-    parser.add_argument("--tokens", type=int, metavar="K", help="send K tokens whatever the SNR")
+    parser.add_argument(
+        "--uplink",
+        metavar="NAME",
+        help="send pictures instead, e.g. jpeg-75: the cloud sees, and the robot needs no model",
+    )
+    parser.add_argument(
+        "--tokens", type=int, metavar="K", help="send K tokens whatever the SNR (bytes of pictures)"
+    )
     parser.add_argument(
         "--sending",
         choices=sorted(POLICIES),
@@ -94,13 +102,13 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Sends the observation. 0 when the cloud answered, 1 when the robot had to fall back."""
-    edge = load_edge(arguments.edge)
-    obs = _observation(arguments, edge.info)
+    edge = None if _sends_pictures(arguments.uplink) else load_edge(arguments.edge)
     with (
         opened(arguments.snr_source, arguments.snr_db) as snr,
         ComVLAClient(
             arguments.target,
             edge=edge,
+            uplink=arguments.uplink,
             link=link_of(arguments),
             quantization=arguments.quantization,
             selector=arguments.selector,
@@ -115,12 +123,18 @@ def run(arguments: argparse.Namespace) -> int:
             snr=snr,
         ) as client,
     ):
+        info = client.info
+        obs = _observation(arguments, info)
         chunk = client.step(obs, arguments.instruction)
     if arguments.json:
         print(json.dumps({"actions": chunk.actions.tolist(), "report": chunk.report.to_dict()}))
     else:
-        print(_text(chunk, edge.info))
+        print(_text(chunk, info))
     return 0 if chunk.source == "cloud" else 1
+
+
+def _sends_pictures(uplink: str | None) -> bool:
+    return uplink is not None and uplink.partition("-")[0] in IMAGE_FORMS
 
 
 def _observation(arguments: argparse.Namespace, info: ModelInfo) -> dict[str, Any]:
@@ -162,7 +176,7 @@ def _text(chunk: ActionChunk, info: ModelInfo) -> str:
         f"K* {report.paper_budget}, framed {report.framed_budget}",
         f"policy    {report.policy}: up to {report.token_budget} tokens in "
         f"{1e3 * report.window_s:.0f} ms, {report.tokens_used} arrived",
-        f"sent      {report.tokens} tokens, {report.payload_bytes} B by the paper's accounting, "
+        f"sent      {report.uplink}: {report.tokens} tokens, {report.payload_bytes} B by the paper's accounting, "
         f"{report.encoded_bytes} B coded, {report.framed_bytes} B framed",
         f"robot ms  {' '.join(f'{k} {v}' for k, v in milliseconds.items())}",
         f"server ms {' '.join(f'{k} {v}' for k, v in server.items()) or '-'}",

@@ -127,6 +127,7 @@ def infer_request_bytes(
     snr: bool = True,
     snr_age: bool = True,
     protocol_version: int = 1,
+    images_length: int = 0,
 ) -> int:
     """Exact serialised length of an ``InferRequest``, without building it.
 
@@ -140,18 +141,21 @@ def infer_request_bytes(
         snr: whether ``snr_db`` is set, even to 0.
         snr_age: whether ``snr_age_s`` is set, even to 0.
         protocol_version: as in the request.
+        images_length: bytes of its ``images`` message, see :func:`comvla.images.images_bytes`; 0
+            where tokens are sent.
 
     Raises:
         CodecError: a negative number.
     """
-    if min(payload_length, step, proprio_dim, protocol_version) < 0:
+    if min(payload_length, step, proprio_dim, protocol_version, images_length) < 0:
         raise CodecError(
-            "expected payload_length, step, proprio_dim and protocol_version of at least 0, got "
-            f"{payload_length}, {step}, {proprio_dim} and {protocol_version}"
+            "expected payload_length, step, proprio_dim, protocol_version and images_length of at "
+            f"least 0, got {payload_length}, {step}, {proprio_dim}, {protocol_version} and "
+            f"{images_length}"
         )
     texts = (session_id, instruction, model_fingerprint)
     lengths = [len(text.encode()) for text in texts]
-    lengths += [4 * proprio_dim, payload_length]
+    lengths += [4 * proprio_dim, payload_length, images_length]
     total = sum(_TAG_BYTES + varint_bytes(length) + length for length in lengths if length)
     total += sum(_TAG_BYTES + varint_bytes(number) for number in (step, protocol_version) if number)
     return total + (_TAG_BYTES + 4) * (snr + snr_age)

@@ -13,11 +13,48 @@ class Quantization(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     QUANTIZATION_FLOAT16: _ClassVar[Quantization]
     QUANTIZATION_INT8: _ClassVar[Quantization]
     QUANTIZATION_INT4: _ClassVar[Quantization]
+
+class ImageCoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    IMAGE_CODING_UNSPECIFIED: _ClassVar[ImageCoding]
+    IMAGE_CODING_JPEG: _ClassVar[ImageCoding]
+    IMAGE_CODING_WEBP: _ClassVar[ImageCoding]
+    IMAGE_CODING_AVIF: _ClassVar[ImageCoding]
+    IMAGE_CODING_H264: _ClassVar[ImageCoding]
+    IMAGE_CODING_DEEP_JSCC: _ClassVar[ImageCoding]
+    IMAGE_CODING_WITT: _ClassVar[ImageCoding]
 QUANTIZATION_UNSPECIFIED: Quantization
 QUANTIZATION_FLOAT32: Quantization
 QUANTIZATION_FLOAT16: Quantization
 QUANTIZATION_INT8: Quantization
 QUANTIZATION_INT4: Quantization
+IMAGE_CODING_UNSPECIFIED: ImageCoding
+IMAGE_CODING_JPEG: ImageCoding
+IMAGE_CODING_WEBP: ImageCoding
+IMAGE_CODING_AVIF: ImageCoding
+IMAGE_CODING_H264: ImageCoding
+IMAGE_CODING_DEEP_JSCC: ImageCoding
+IMAGE_CODING_WITT: ImageCoding
+
+class CodedImage(_message.Message):
+    __slots__ = ("data", "height", "width")
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    data: bytes
+    height: int
+    width: int
+    def __init__(self, data: _Optional[bytes] = ..., height: _Optional[int] = ..., width: _Optional[int] = ...) -> None: ...
+
+class CodedImages(_message.Message):
+    __slots__ = ("coding", "views", "follows_step")
+    CODING_FIELD_NUMBER: _ClassVar[int]
+    VIEWS_FIELD_NUMBER: _ClassVar[int]
+    FOLLOWS_STEP_FIELD_NUMBER: _ClassVar[int]
+    coding: ImageCoding
+    views: _containers.RepeatedCompositeFieldContainer[CodedImage]
+    follows_step: int
+    def __init__(self, coding: _Optional[_Union[ImageCoding, str]] = ..., views: _Optional[_Iterable[_Union[CodedImage, _Mapping]]] = ..., follows_step: _Optional[int] = ...) -> None: ...
 
 class GetModelRequest(_message.Message):
     __slots__ = ("protocol_version",)
@@ -26,7 +63,7 @@ class GetModelRequest(_message.Message):
     def __init__(self, protocol_version: _Optional[int] = ...) -> None: ...
 
 class GetModelResponse(_message.Message):
-    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size", "progressive")
+    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size", "image_codings", "progressive")
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_NAME_FIELD_NUMBER: _ClassVar[int]
     MODEL_FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
@@ -44,6 +81,7 @@ class GetModelResponse(_message.Message):
     MAX_REQUEST_BYTES_FIELD_NUMBER: _ClassVar[int]
     SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
     IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_CODINGS_FIELD_NUMBER: _ClassVar[int]
     PROGRESSIVE_FIELD_NUMBER: _ClassVar[int]
     protocol_version: int
     model_name: str
@@ -62,11 +100,12 @@ class GetModelResponse(_message.Message):
     max_request_bytes: int
     server_version: str
     image_size: _containers.RepeatedScalarFieldContainer[int]
+    image_codings: _containers.RepeatedScalarFieldContainer[ImageCoding]
     progressive: bool
-    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ..., progressive: bool = ...) -> None: ...
+    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ..., image_codings: _Optional[_Iterable[_Union[ImageCoding, str]]] = ..., progressive: bool = ...) -> None: ...
 
 class InferRequest(_message.Message):
-    __slots__ = ("session_id", "step", "instruction", "proprio", "payload", "model_fingerprint", "snr_db", "snr_age_s", "protocol_version")
+    __slots__ = ("session_id", "step", "instruction", "proprio", "payload", "model_fingerprint", "snr_db", "snr_age_s", "protocol_version", "images")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     INSTRUCTION_FIELD_NUMBER: _ClassVar[int]
@@ -76,6 +115,7 @@ class InferRequest(_message.Message):
     SNR_DB_FIELD_NUMBER: _ClassVar[int]
     SNR_AGE_S_FIELD_NUMBER: _ClassVar[int]
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    IMAGES_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     step: int
     instruction: str
@@ -85,7 +125,8 @@ class InferRequest(_message.Message):
     snr_db: float
     snr_age_s: float
     protocol_version: int
-    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., instruction: _Optional[str] = ..., proprio: _Optional[_Iterable[float]] = ..., payload: _Optional[bytes] = ..., model_fingerprint: _Optional[str] = ..., snr_db: _Optional[float] = ..., snr_age_s: _Optional[float] = ..., protocol_version: _Optional[int] = ...) -> None: ...
+    images: CodedImages
+    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., instruction: _Optional[str] = ..., proprio: _Optional[_Iterable[float]] = ..., payload: _Optional[bytes] = ..., model_fingerprint: _Optional[str] = ..., snr_db: _Optional[float] = ..., snr_age_s: _Optional[float] = ..., protocol_version: _Optional[int] = ..., images: _Optional[_Union[CodedImages, _Mapping]] = ...) -> None: ...
 
 class InferResponse(_message.Message):
     __slots__ = ("session_id", "step", "actions", "action_horizon", "action_dim", "tokens_used", "batch_size", "cloud_flops", "timings", "load", "model_fingerprint")

@@ -44,9 +44,9 @@ class PolicyServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Infer(self, request, context):
-        """Turns pruned visual tokens into a chunk of actions. Idempotent by (session_id, step): a retry
-        is answered like the first attempt. Call it with a deadline; it is the robot's patience, and
-        work that would be late is dropped.
+        """Turns pruned visual tokens, or coded pictures, into a chunk of actions. Idempotent by
+        (session_id, step): a retry is answered like the first attempt. Call it with a deadline; it is
+        the robot's patience, and work that would be late is dropped.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

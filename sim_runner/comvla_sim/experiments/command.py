@@ -25,6 +25,10 @@ Runs a policy in closed loop: every method at every K on the same layouts, which
 One line per episode is appended to the results file as it ends; the same command goes on where it
 was stopped, and runs only what is missing.
 """
+OWN = """\
+  package.module:ClassName a selector of your own (docs/selectors.md)
+Pictures, and methods that decide themselves how much they send, run once, whatever --k says.
+"""
 EPILOG = """\
 conditions:
   normal             as it should be
@@ -35,17 +39,20 @@ conditions:
 examples:
   comvla-sim eval --method full,hard_voting,random --k 32,16 --episodes 20
   comvla-sim eval --method hard_voting --k 16 --condition blind,wrong_instruction --json
+  comvla-sim eval --method full,hard_voting,jpeg-75,h264-28 --k 32
   comvla-sim eval --method hard_voting --k 32 --target robot-cloud:50051
 """
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Registers the subcommand."""
+    from comvla_sim.experiments.methods import table
+
     parser = subparsers.add_parser(
         "eval",
         help="measure success in closed loop, with intervals and paired tests",
         description=DESCRIPTION,
-        epilog=EPILOG,
+        epilog=f"methods:\n{table()}\n{OWN}\n{EPILOG}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
@@ -54,7 +61,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--model", default="mini", help="mini, random, or a checkpoint folder (mini)"
     )
-    parser.add_argument("--method", type=_names, default="full,hard_voting", help="a,b,...")
+    parser.add_argument(
+        "--method", type=_names, default="full,hard_voting", help="a,b,... of those below"
+    )
     parser.add_argument("--k", type=_numbers, default="32", help="tokens sent: 64,32,... (32)")
     parser.add_argument("--condition", type=_names, default="normal", help="see below (normal)")
     parser.add_argument("--episodes", type=int, default=20, help="layouts per instruction (20)")
@@ -100,6 +109,7 @@ def run(args: argparse.Namespace) -> int:
         episodes=args.episodes,
     )
     grid.check(num_tokens=subject.num_tokens, seed=args.seed)
+    _check_server_options(args.method, args.target)
     specs = list(grid.specs(subject.num_tokens))
     path = args.out or _default_path(settings, subject)
     with ResultsFile(path, subject.settings) as results:
@@ -132,6 +142,19 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     return 0
+
+
+def _check_server_options(methods: Sequence[str], target: str | None) -> None:
+    """Refuses what a server that runs already would have to be started with."""
+    from comvla_sim.experiments.methods import find_method
+
+    for name in methods:
+        option = find_method(name).server_option
+        if option and target is not None:
+            raise EvaluationError(
+                f"--method {name} is done by the cloud half, and the server at {target} runs as it was "
+                f"started: leave --target out, or serve with {option} and evaluate --method full there"
+            )
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from comvla_server.service import STATUS
 from comvla_server.settings import ServerSettings
 from comvla_server.validation import Validator
 from comvla_server.version import server_version
+from comvla_server.vision import Vision
 
 
 class InProcessTransport:
@@ -24,10 +25,11 @@ class InProcessTransport:
 
     Args:
         cloud: the cloud half.
+        vision: the vision half, for clients that send pictures.
     """
 
-    def __init__(self, cloud: CloudHalf) -> None:
-        self._engine = Engine(cloud)
+    def __init__(self, cloud: CloudHalf, vision: Vision | None = None) -> None:
+        self._engine = Engine(cloud, vision)
         self._max_request_bytes = ServerSettings().max_request_bytes
         self._validator = Validator(self._engine, self._max_request_bytes)
 
@@ -40,6 +42,7 @@ class InProcessTransport:
             max_request_bytes=self._max_request_bytes,
             server_version=server_version(),
             progressive=True,
+            image_codings=self._engine.image_codings,
         )
 
     def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
@@ -65,7 +68,7 @@ class InProcessTransport:
             actions=actions.ravel().tolist(),
             action_horizon=actions.shape[0],
             action_dim=actions.shape[1],
-            tokens_used=len(policy_request.positions),
+            tokens_used=self._engine.num_tokens(policy_request),
             batch_size=1,
             cloud_flops=self._engine.flops(policy_request),
             timings=ServerTimings(

@@ -39,10 +39,25 @@ class ObservedEdge:
         """Description of the model."""
         return self._edge.info
 
-    def encode(self, images: Sequence[npt.NDArray[np.uint8]]) -> Any:
+    @property
+    def any_image_size(self) -> bool:
+        """Whether the model resizes pictures itself."""
+        return bool(getattr(self._edge, "any_image_size", False))
+
+    @property
+    def sees_instruction(self) -> bool:
+        """Whether visual tokens depend on the instruction."""
+        return bool(getattr(self._edge, "sees_instruction", False))
+
+    def encode(
+        self, images: Sequence[npt.NDArray[np.uint8]], instruction: str | None = None
+    ) -> Any:
         """Visual tokens (N, D)."""
         self.projected = None
-        self.tokens = self._edge.encode(images)
+        edge: Any = self._edge
+        self.tokens = (
+            edge.encode(images, instruction) if self.sees_instruction else edge.encode(images)
+        )
         return self.tokens
 
     def project(self, tokens: Any) -> Any:
@@ -54,6 +69,16 @@ class ObservedEdge:
         """Queries (Q, d) of the instruction, or of the one that was heard instead."""
         self.queries = self._edge.text_queries(self._heard or instruction)
         return self.queries
+
+    def lightvla_scores(self, projected: Any, instruction: str, proprio: Any) -> Any:
+        """LightVLA's scores (N, N), by the words that were heard."""
+        edge: Any = self._edge
+        return edge.lightvla_scores(projected, self._heard or instruction, proprio)
+
+    def text_driven_scores(self, projected: Any, instruction: str) -> Any:
+        """VLA-ADP's scores (N,), by the words that were heard."""
+        edge: Any = self._edge
+        return edge.text_driven_scores(projected, self._heard or instruction)
 
     def queries_of(self, instruction: str) -> Any:
         """Queries (Q, d) of exactly these words, without remembering them."""
@@ -88,13 +113,17 @@ class SelectionStatistics:
 
     Args:
         edge: the observed model that the episode's client uses.
-        selector: the episode's selector.
+        selector: one like the episode's; None where pictures were sent, so that nothing was selected.
         other_instruction: words of another task that the same pictures allow; None skips overlap.
         seed: for selectors that draw.
     """
 
     def __init__(
-        self, edge: ObservedEdge, selector: Selector, other_instruction: str | None, seed: int
+        self,
+        edge: ObservedEdge,
+        selector: Selector | None,
+        other_instruction: str | None,
+        seed: int,
     ) -> None:
         self._edge = edge
         self._selector = selector
@@ -103,7 +132,10 @@ class SelectionStatistics:
         self._distinct = 0
         self._overlap = 0.0
         self._other_queries: Any = None
-        if other_instruction is not None and selector.uses_language:
+        self._listens = selector is not None and selector.uses_language
+        # What decides itself how much it keeps would keep another number for other words.
+        comparable = selector is not None and self._listens and not selector.sends_all
+        if other_instruction is not None and comparable:
             self._other_queries = edge.queries_of(other_instruction)
         views = edge.info.grid[0]
         self._visible = [0] * views
@@ -121,7 +153,9 @@ class SelectionStatistics:
         """
         self._frames += 1
         edge = self._edge
-        if self._selector.uses_language:
+        if self._selector is None:
+            return
+        if self._listens:
             self._distinct += int((hard_votes(edge.queries, edge.projected) > 0).sum())
         if self._other_queries is not None:
             rng = np.random.default_rng([self._seed, self._frames])
@@ -144,7 +178,7 @@ class SelectionStatistics:
 
     def as_dict(self) -> dict[str, Any]:
         """Sums over the frames; None for what was not looked at."""
-        looked = self._selector.uses_language
+        looked = self._listens
         compared = self._other_queries is not None
         return {
             "frames": self._frames,

@@ -6,15 +6,16 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from comvla.errors import ComVLAError
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout
-from comvla_sim.experiments.selectors import METHODS
+from comvla_sim.experiments.methods import find_method
 
 CONDITIONS = ("normal", "blind", "wrong_instruction", "wrong_selection")
 """How an episode is run: as it should be, or with one thing wrong (:mod:`.rollout`)."""
 
 FULL = "full"
-"""The method that sends all tokens; it has one K only."""
+"""The method that sends all tokens: what the others are compared with."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class EpisodeSpec:
 
     Attributes:
         condition: one of :data:`CONDITIONS`.
-        method: name of a selector.
-        k: tokens sent; N for ``"full"``.
+        method: name of a method (:mod:`.methods`).
+        k: tokens sent; N for methods that decide themselves what they send.
         task: name of the world's task.
         episode: number that chooses the layout.
     """
@@ -61,8 +62,8 @@ class Grid:
 
     Attributes:
         conditions: see :data:`CONDITIONS`.
-        methods: names of selectors.
-        ks: numbers of tokens; ``"full"`` runs once, not once for each.
+        methods: names of methods.
+        ks: numbers of tokens; a method that decides itself what it sends runs once, not once for each.
         tasks: names of tasks.
         episodes: layouts for each task.
     """
@@ -84,12 +85,12 @@ class Grid:
             EvaluationError: names what is wrong.
         """
         _known("--condition", self.conditions, CONDITIONS)
-        _known("--method", self.methods, tuple(METHODS))
+        self._check_methods()
         if self.episodes < 1:
             raise EvaluationError(f"--episodes must be at least 1, got {self.episodes}")
         for episode in (0, self.episodes - 1):
             evaluation_layout(seed, episode)
-        if any(method != FULL for method in self.methods) and not self.ks:
+        if not all(find_method(method).decides_itself for method in self.methods) and not self.ks:
             raise EvaluationError("--k is empty: give numbers of tokens such as 512,64,32,16")
         for k in self.ks:
             if not 1 <= k <= num_tokens:
@@ -100,13 +101,29 @@ class Grid:
                 "hard_voting to --method"
             )
 
+    def _check_methods(self) -> None:
+        if not self.methods:
+            raise EvaluationError("--method is empty: comvla-sim eval --help lists what there is")
+        for name in self.methods:
+            try:
+                form = find_method(name).form()
+            except ComVLAError as error:
+                raise EvaluationError(f"--method {name}: {error}") from error
+            except ValueError as error:
+                raise EvaluationError(f"--method {name}: {error}") from error
+            if getattr(form, "adjustable", False):
+                raise EvaluationError(
+                    f"--method {name}: the link decides its quality, and an ideal link decides nothing: "
+                    f"name one, such as {name}-75"
+                )
+
     def specs(self, num_tokens: int) -> Iterator[EpisodeSpec]:
         """All episodes, layout by layout, so that whatever is there already can be compared."""
         for episode, task in itertools.product(range(self.episodes), self.tasks):
             for condition, method in itertools.product(self.conditions, self.methods):
-                if condition == "wrong_selection" and not METHODS[method].uses_language:
+                if condition == "wrong_selection" and not find_method(method).listens:
                     continue  # what does not listen cannot be misled
-                for k in (num_tokens,) if method == FULL else self.ks:
+                for k in (num_tokens,) if find_method(method).decides_itself else self.ks:
                     yield EpisodeSpec(condition, method, k, task, episode)
 
 

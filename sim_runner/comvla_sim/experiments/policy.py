@@ -13,7 +13,7 @@ RANDOM = "random"
 
 
 def load_policy(model: str) -> tuple[EdgeModel, CloudModel]:
-    """Both halves on the CPU.
+    """Both halves on the CPU, the edge half with the weights that LightVLA and VLA-ADP need.
 
     Args:
         model: ``"mini"``, ``"random"``, or a checkpoint folder.
@@ -21,11 +21,15 @@ def load_policy(model: str) -> tuple[EdgeModel, CloudModel]:
     Raises:
         CheckpointError: missing, damaged or foreign.
     """
-    from comvla_vla import load_cloud, load_edge, random_policy
+    from comvla_vla import lend_pruners, load_cloud, load_edge, random_policy
 
     if model == RANDOM:
-        return random_policy(seed=0)
-    return load_edge(model), load_cloud(model)
+        edge, cloud = random_policy(seed=0)
+        lend_pruners(edge, cloud)
+        return edge, cloud
+    edge, cloud = load_edge(model), load_cloud(model)
+    lend_pruners(edge, cloud)
+    return edge, cloud
 
 
 def load_edge_half(model: str) -> EdgeModel:

@@ -14,9 +14,9 @@ from comvla_client.edge import EdgeModel
 from comvla_client.transport import Transport
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout, foreign_layout
+from comvla_sim.experiments.methods import find_method
 from comvla_sim.experiments.observing import ObservedEdge, SelectionStatistics
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
-from comvla_sim.experiments.selectors import METHODS
 from comvla_sim.worlds.base import Task, World
 
 Pictures = npt.NDArray[np.uint8]
@@ -142,10 +142,11 @@ def run_episode(
     observation, _ = world.reset(seed=layout_seed, options={"task": spec.task})
     roles = cast(world, spec, layout_seed)
     observed = ObservedEdge(edge, roles.heard.instruction if roles.heard else None)
-    selector = METHODS[spec.method]()
+    method = find_method(spec.method)
+    form = method.form()
     compared = roles.other if spec.condition == "normal" else None
     statistics = SelectionStatistics(
-        observed, selector, compared.instruction if compared else None, layout_seed
+        observed, method.selector(), compared.instruction if compared else None, layout_seed
     )
     totals = _Totals()
     success = other_success = False
@@ -153,8 +154,8 @@ def run_episode(
     with ComVLAClient(
         target,
         edge=observed,
-        selector=selector,
-        budget=spec.k,
+        uplink=form,
+        budget=spec.k if form.in_pieces else "paper",
         quantization=settings.quantization,
         deadline_s=_DEADLINE_S,
         seed=layout_seed,

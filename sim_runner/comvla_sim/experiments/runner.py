@@ -16,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.methods import Method, find_method
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
 from comvla_sim.experiments.policy import load_edge_half, load_policy, shown_model
 from comvla_sim.experiments.results import FORMAT, ResultsFile, Row
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from comvla_client.edge import EdgeModel
     from comvla_client.transport import Transport
     from comvla_sim.worlds.base import Task, World
+    from comvla_vla import CloudModel
 
 Measured = tuple[EpisodeSpec, dict[str, Any]]
 
@@ -103,17 +105,16 @@ class Worker:
     """
 
     def __init__(self, settings: EvalSettings) -> None:
-        from comvla_sim.experiments.in_process import InProcessTransport
         from comvla_sim.worlds import make
 
         self._settings = settings
         self._edge: EdgeModel
-        self._target: Transport | str
+        self._cloud: CloudModel | None = None
+        self._targets: dict[str, Transport] = {}
         if settings.target is None:
-            self._edge, cloud = load_policy(settings.model)
-            self._target = InProcessTransport(cloud)
+            self._edge, self._cloud = load_policy(settings.model)
         else:
-            self._edge, self._target = load_edge_half(settings.model), settings.target
+            self._edge = load_edge_half(settings.model)
         height, width = self._edge.info.image_size
         if height != width:
             raise EvaluationError(
@@ -127,7 +128,25 @@ class Worker:
         """One episode."""
         from comvla_sim.experiments.rollout import run_episode
 
-        return spec, run_episode(self._world, self._edge, self._target, spec, self._settings)
+        target = self._target(find_method(spec.method))
+        return spec, run_episode(self._world, self._edge, target, spec, self._settings)
+
+    def _target(self, method: Method) -> Transport | str:
+        """Where a method's requests go: the user's server, or the cloud half here, run as the method needs."""
+        from comvla_server.vision import VisionHalf
+        from comvla_sim.experiments.in_process import InProcessTransport
+
+        if self._settings.target is not None:
+            return self._settings.target
+        cloud = self._cloud
+        assert cloud is not None, "without a server both halves are here"
+        key = method.server_option
+        if key not in self._targets:
+            if method.in_cloud is not None:
+                cloud = cloud.with_options(method.in_cloud(cloud.config.backbone.layers))
+            vision = VisionHalf(self._edge)  # type: ignore[arg-type]
+            self._targets[key] = InProcessTransport(cloud, vision)
+        return self._targets[key]
 
     def close(self) -> None:
         """Frees the world."""

@@ -9,13 +9,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from comvla_sim.experiments.methods import order
 from comvla_sim.experiments.plan import CONDITIONS, FULL
 from comvla_sim.experiments.results import Row
-from comvla_sim.experiments.selectors import METHODS
 from comvla_sim.experiments.statistics import mcnemar, wilson_interval
-
-# What is compared with comes first, then the product, then controls.
-_METHOD_ORDER = (FULL, *(method for method in METHODS if method != FULL))
 
 Entry = tuple[str, str, int]
 """Condition, method, K."""
@@ -47,9 +44,9 @@ def summarise(rows: Iterable[Row]) -> dict[str, Any]:
     }
 
 
-def _order(entry: Entry) -> tuple[int, int, int]:
+def _order(entry: Entry) -> tuple[int, tuple[int, str], int]:
     condition, method, k = entry
-    return CONDITIONS.index(condition), _METHOD_ORDER.index(method), -k
+    return CONDITIONS.index(condition), order(method), -k
 
 
 def _comparable(first: Entry, second: Entry) -> bool:

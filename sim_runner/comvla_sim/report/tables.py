@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
+from comvla_sim.experiments.methods import shown_k
 from comvla_sim.report.terminal import entry_name, percent
+
+_OWN = "its own size"
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,13 @@ def all_tables(summary: dict[str, Any]) -> list[Table]:
 
 
 def _success_by_k(lines: Sequence[dict[str, Any]]) -> Table:
-    ks = sorted({line["k"] for line in lines}, reverse=True)
-    cells = {(_series(line), line["k"]): rate_with_interval(line) for line in lines}
+    ks = sorted({line["k"] for line in lines if _has_k(line)}, reverse=True)
+    heads = [f"K = {k}" for k in ks]
+    own = any(not _has_k(line) for line in lines)
+    cells = {
+        (_series(line), f"K = {line['k']}" if _has_k(line) else _OWN): rate_with_interval(line)
+        for line in lines
+    }
     names = dict.fromkeys(_series(line) for line in lines)
     counts = sorted({line["episodes"] for line in lines})
     episodes = " to ".join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))
@@ -83,9 +91,16 @@ def _success_by_k(lines: Sequence[dict[str, Any]]) -> Table:
         "Success by number of tokens",
         f"Percent of episodes over all instructions with 95 % Wilson intervals; {episodes} episodes "
         "per cell, the same layouts everywhere.",
-        ("method", *(f"K = {k}" for k in ks)),
-        tuple((name, *(cells.get((name, k), "–") for k in ks)) for name in names),
+        ("method", *heads, *([_OWN] if own else [])),
+        tuple(
+            (name, *(cells.get((name, head), "–") for head in (*heads, *([_OWN] if own else []))))
+            for name in names
+        ),
     )
+
+
+def _has_k(line: dict[str, Any]) -> bool:
+    return shown_k(line["method"], line["k"]).isdigit()
 
 
 def _series(line: dict[str, Any]) -> str:

@@ -9,6 +9,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from comvla_sim.experiments.methods import shown_k
+
 _MAX_COMPARISONS = 12
 
 Line = dict[str, Any]
@@ -21,7 +23,8 @@ def percent(value: float | None) -> str:
 
 def entry_name(entry: Line) -> str:
     """Condition, method and K in a few words; the normal condition goes without saying."""
-    method = "full" if entry["method"] == "full" else f"{entry['method']} {entry['k']}"
+    k = "" if entry["method"] == "full" else shown_k(entry["method"], entry["k"])
+    method = f"{entry['method']} {k}" if k.isdigit() else entry["method"]
     return method if entry["condition"] == "normal" else f"{entry['condition']}: {method}"
 
 
@@ -67,7 +70,7 @@ def _over_all_tasks(lines: Sequence[Line]) -> Table:
         votes = selection["distinct_votes"]
         cells = [
             line["method"],
-            str(line["k"]),
+            shown_k(line["method"], line["k"]),
             f"{line['successes']}/{line['episodes']}",
             percent(line["success_rate"]),
             f"{percent(line['low'])}–{percent(line['high'])}",
@@ -97,7 +100,7 @@ def _print_by_task(condition: str, lines: Sequence[Line], console: Console) -> N
     table = _table(["method"], heads)
     for method, k in dict.fromkeys((line["method"], line["k"]) for line in lines):
         row = (cells.get((method, k, task), "–") for task in tasks)
-        table.add_row(method, str(k), *row)
+        table.add_row(method, shown_k(method, k), *row)
     console.print(title, style="bold")
     console.print(table)
 
