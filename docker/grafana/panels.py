@@ -55,7 +55,7 @@ def ratio(part: str, whole: str) -> str:
 
 ANSWERED = rate("comvla_step_duration_seconds_count", ',outcome=~"ok|repeat"')
 CALLS = rate("comvla_step_duration_seconds_count")
-BRIDGED = rate("comvla_robot_fallbacks_total")
+BRIDGED = rate("comvla_unanswered_steps_total")
 FRAMED = rate("comvla_tx_framed_bytes_total")
 
 DASHBOARDS: dict[str, tuple[str, list[Panel]]] = {
@@ -100,7 +100,7 @@ DASHBOARDS: dict[str, tuple[str, list[Panel]]] = {
                         "fallback share",
                     ),
                 ],
-                "Robots say with each request how many steps before it got no answer.",
+                "Gaps between the answered steps of each robot.",
                 maximum=1,
             ),
             Panel(
