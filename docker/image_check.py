@@ -123,7 +123,13 @@ def check(root_server: Path, root_edge: Path, port: int, admin_port: int) -> dic
             wait_until_ready(process, server_at, server, log)
             results["start_s"] = round(time.monotonic() - started, 2)
             target = f"127.0.0.1:{port}"
-            step = run(*command_in(edge_at, edge, [*edge.entrypoint, "step", target, "--json"]))
+            step = run(
+                *command_in(
+                    edge_at,
+                    edge,
+                    [*edge.entrypoint, "step", target, "--json", "--deadline-s", "30"],
+                )
+            )
             answer = json.loads(step.stdout)
             if answer["report"]["source"] != "cloud" or len(answer["actions"]) < 1:
                 raise CheckError(f"expected actions from the cloud, got {step.stdout}")
@@ -189,7 +195,7 @@ def main() -> int:
         WORK.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(WORK / "source", ignore_errors=True)
         archive = bare_debian()
-        wheels = collect_wheels(["server", "edge"])
+        wheels = collect_wheels(["server", "images", "edge"])
         server, edge = (build(image, archive, wheels) for image in ("server", "edge"))
         report = check(server, edge, args.port, args.admin_port)
         report["size_mb"] = {"server": size_mb(server), "edge": size_mb(edge)}

@@ -12,7 +12,11 @@ set -eu
 image=${1:?usage: install.sh server|edge SOURCE [WHEELS]}
 source=${2:?usage: install.sh server|edge SOURCE [WHEELS]}
 wheels=${3:-}
-case $image in server | edge) ;; *) echo "install.sh: expected server or edge, got '$image'" >&2; exit 2 ;; esac
+case $image in
+server) extras=server,images ;;
+edge) extras=edge ;;
+*) echo "install.sh: expected server or edge, got '$image'" >&2; exit 2 ;;
+esac
 
 export DEBIAN_FRONTEND=noninteractive
 apt-get update -qq
@@ -31,7 +35,7 @@ if [ -n "$wheels" ]; then
 elif [ -n "${TORCH_INDEX_URL:-}" ]; then
     set -- "$@" --extra-index-url "$TORCH_INDEX_URL"
 fi
-/opt/comvla/bin/python -m pip install "$@" "comvla[$image] @ file://$source"
+/opt/comvla/bin/python -m pip install "$@" "comvla[$extras] @ file://$source"
 
 # Nothing is compiled or installed in a running container.
 site=$(/opt/comvla/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
