@@ -5,7 +5,7 @@
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench proto train-mini
+.PHONY: help demo test lint bench image-check proto train-mini
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -45,6 +45,11 @@ bench: ## transport, edge, batching and model, each against a limit measured in 
 	$(BIN)/comvla-sim bench edge $(ARGS)
 	$(BIN)/comvla-sim bench batching $(ARGS)
 	$(BIN)/comvla-sim bench model $(ARGS)
+
+image-check: ## build what the Dockerfiles build without a container engine, and call it (root)
+	@tools/setup.sh dev
+	@tools/setup.sh image
+	$(BIN)/python docker/image_check.py $(ARGS)
 
 proto: ## regenerate the code of proto/comvla/v1/policy.proto
 	@tools/proto.sh

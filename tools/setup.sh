@@ -5,13 +5,14 @@
 #
 #   tools/setup.sh sim     what `make demo` and `make bench` need
 #   tools/setup.sh dev     sim, and what `make test` and `make lint` need
+#   tools/setup.sh image   what `make image-check` needs besides dev
 #   tools/setup.sh proto   the old protobuf generator, in an environment of its own
 #
 # Variables: PYTHON (default python3) makes the environment, VENV (default .venv) is where it goes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-extra=${1:?usage: tools/setup.sh sim|dev|proto}
+extra=${1:?usage: tools/setup.sh sim|dev|image|proto}
 python=${PYTHON:-python3}
 venv=${VENV:-.venv}
 
@@ -133,5 +134,11 @@ proto)
     install_into .venv-proto proto "$(state_of .venv-proto tools/proto-requirements.txt)" \
         --requirement tools/proto-requirements.txt
     ;;
-*) die "expected sim, dev or proto, got '$extra'" ;;
+image)
+    if ! command -v debootstrap >/dev/null; then
+        { may_install && apt_install debootstrap; } ||
+            die "image-check needs debootstrap; type: sudo apt-get install debootstrap"
+    fi
+    ;;
+*) die "expected sim, dev, image or proto, got '$extra'" ;;
 esac

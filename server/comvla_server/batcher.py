@@ -117,8 +117,7 @@ class Batcher:
         ticket = Ticket(session_id, step, digest, request, now_s, outcome)
         if session.queued is not None:
             session.queued.resolve(superseded(session_id, session.queued.step, step))
-        session.newest_step = max(session.newest_step, step)
-        session.queued = ticket
+        session.note_admitted(ticket)
         self._queue[session_id] = session
         self._work.set()
         return ticket
@@ -251,8 +250,7 @@ class Batcher:
         self._metrics.inference_flops.inc(answer.cloud_flops)
         self._metrics.step_phase.labels("queue").observe(answer.queue_s)
         self._metrics.step_phase.labels("predict").observe(answer.predict_s)
-        session.recorded = ticket
-        session.answers += 1
+        self._metrics.unanswered_steps.inc(session.note_answered(ticket))
         ticket.resolve(answer)
 
 

@@ -13,6 +13,7 @@ from comvla_server.refusals import Reason
 
 # 1 to 500 ms: a control period is tens of milliseconds, anything above is a miss.
 SECONDS_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5)
+SNR_BUCKETS = (-10, -5, 0, 2.5, 5, 7.5, 10, 12.5, 15, 17.5, 20, 25, 30, 40)
 TOKEN_BUCKETS = (1, 4, 8, 16, 32, 48, 64, 96, 128, 256, 512)
 BATCH_BUCKETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
@@ -85,6 +86,15 @@ class Metrics:
             "Infer and InferProgressive calls that ended without actions, by reason.",
             ["reason"],
             registry=self.registry,
+        )
+        self.unanswered_steps = self._counter(
+            "comvla_unanswered_steps",
+            "Steps that robots had to bridge: gaps between the answered steps of a session.",
+        )
+        self.reported_snr_db = self._histogram(
+            "comvla_reported_snr_db",
+            "SNR that robots reported when they sized what they sent, dB.",
+            SNR_BUCKETS,
         )
         self.streams = Counter(
             "comvla_progressive_streams",

@@ -261,6 +261,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         on_record = ticket is not None and ticket.outcome.done()
         if ticket is None:
             assert policy_request is not None
+            if request.HasField("snr_db"):
+                self._metrics.reported_snr_db.observe(request.snr_db)
             ticket = batcher.admit(request.session_id, request.step, policy_request, digest)
         answer = await batcher.wait(ticket, deadline_s)
         response = self._response(request, runtime, answer)

@@ -20,6 +20,7 @@ class Session:
         session_id: name chosen by the robot.
         last_seen_s: monotonic time of its last call.
         owner: name of the identity that opened it; empty where the server asks nobody who they are.
+        first_step: the step with which it was first seen here, -1 before that.
         newest_step: highest step admitted so far, -1 before the first.
         queued: its observation that waits, at most one.
         running: its observation inside the model, at most one.
@@ -30,6 +31,7 @@ class Session:
     session_id: str
     last_seen_s: float
     owner: str = ""
+    first_step: int = -1
     newest_step: int = -1
     queued: Ticket | None = None
     running: Ticket | None = None
@@ -48,6 +50,24 @@ class Session:
             return None
         outcome = self.recorded.outcome.result()
         return outcome.tokens_used if isinstance(outcome, Answer) else None
+
+    def note_admitted(self, ticket: Ticket) -> None:
+        """Lets an observation wait; it is the newest."""
+        if self.newest_step < 0:
+            self.first_step = ticket.step
+        self.newest_step = max(self.newest_step, ticket.step)
+        self.queued = ticket
+
+    def note_answered(self, ticket: Ticket) -> int:
+        """Puts an answered step on record.
+
+        Returns:
+            Steps between it and the answered one before, which the robot had to bridge.
+        """
+        before = self.first_step - 1 if self.recorded is None else self.recorded.step
+        self.recorded = ticket
+        self.answers += 1
+        return max(0, ticket.step - before - 1)
 
     def find(self, step: int, digest: bytes) -> Ticket | None:
         """The ticket of a repeated step, or None for a new one.

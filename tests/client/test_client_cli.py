@@ -42,6 +42,24 @@ def test_step_prints_actions_and_report_as_json(
     assert out["report"]["tokens"] == out["report"]["tokens_used"] == 16
 
 
+def test_step_repeats_as_one_robot(
+    server: BackgroundServer, checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--edge", str(checkpoint), "--tokens", "16", "--deadline-s", "20", "--json"]
+    assert main(["step", server.target, *arguments, "--repeat", "3", "--every-s", "0"]) == 0
+    reports = [json.loads(line)["report"] for line in capsys.readouterr().out.splitlines()]
+    assert [report["step"] for report in reports] == [0, 1, 2]
+    assert len({report["session"] for report in reports}) == 1
+
+
+@pytest.mark.parametrize("option", [("--repeat", "-1"), ("--every-s", "nan"), ("--every-s", "-1")])
+def test_step_refuses_a_rhythm_that_cannot_be(
+    option: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["step", "127.0.0.1:1", *option]) == 2
+    assert "--repeat 0" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("stub_edge")
 def test_step_tells_the_story_in_words(capsys: pytest.CaptureFixture[str]) -> None:
     with serving() as (target, _):

@@ -394,3 +394,17 @@ async def test_utilization_is_the_busy_share_of_the_last_seconds(
     await task
     clock.now_s += 10
     assert batcher.utilization == 0.0
+
+
+async def test_gaps_between_answered_steps_are_steps_that_a_robot_bridged(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    metrics = Metrics()
+    batcher = make(metrics=metrics)
+    cloud.release()
+    # First seen at 7, whatever came before; 8 and 9 are missing, then 11 and 12; another robot none.
+    for step in (7, 10, 13, 14):
+        await ask(batcher, "a", step)
+    await ask(batcher, "b", 3)
+    await ask(batcher, "b", 3)
+    assert metrics.registry.get_sample_value("comvla_unanswered_steps_total") == 4

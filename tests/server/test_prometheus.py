@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-import socket
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import numpy as np
-import pytest
+from prometheus_process import needs_prometheus, prometheus, value
 from server_stubs import eventually
 
 from comvla_client import ComVLAClient, StepReport
@@ -19,56 +13,7 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_vla import random_policy
 
-PROMETHEUS = shutil.which("prometheus")
-
-pytestmark = pytest.mark.skipif(
-    PROMETHEUS is None, reason="needs the prometheus binary: apt-get install prometheus"
-)
-
-
-@contextlib.contextmanager
-def prometheus(folder: Path, scraped: str) -> Iterator[httpx.Client]:
-    """A Prometheus that scrapes one address five times a second; yields a client of its API."""
-    config = folder / "prometheus.yml"
-    config.write_text(
-        "global: {scrape_interval: 200ms, scrape_timeout: 200ms}\n"
-        "scrape_configs:\n"
-        f"  - {{job_name: comvla, static_configs: [{{targets: ['{scraped}']}}]}}\n"
-    )
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    arguments = [
-        str(PROMETHEUS),
-        f"--config.file={config}",
-        f"--storage.tsdb.path={folder / 'data'}",
-        f"--web.listen-address=127.0.0.1:{port}",
-        "--log.level=error",
-    ]
-    with (
-        subprocess.Popen(
-            arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        ) as process,
-        httpx.Client(base_url=f"http://127.0.0.1:{port}") as http,
-    ):
-        try:
-            eventually(lambda: _ready(http))
-            yield http
-        finally:
-            process.kill()
-
-
-def _ready(http: httpx.Client) -> bool:
-    with contextlib.suppress(httpx.TransportError):
-        return http.get("/-/ready").status_code == 200
-    return False
-
-
-def query(http: httpx.Client, expression: str) -> float | None:
-    """Latest value of an expression, None while there is none."""
-    answer = http.get("/api/v1/query", params={"query": expression}).json()
-    assert answer["status"] == "success", answer
-    series = answer["data"]["result"]
-    return float(series[0]["value"][1]) if series else None
+pytestmark = needs_prometheus
 
 
 def drive(server: BackgroundServer, steps: int) -> list[StepReport]:
@@ -101,8 +46,8 @@ def test_prometheus_answers_with_the_bytes_that_the_client_counted(tmp_path: Pat
                 'comvla_step_duration_seconds_count{outcome="ok"}': len(reports),
             }
             assert min(counted.values()) > 0
-            for expression, value in counted.items():
+            for expression, total in counted.items():
                 # Nothing is sent any more: the next scrape has the final value.
-                assert eventually(lambda e=expression, v=value: query(http, e) == v), expression
-            assert query(http, 'up{job="comvla"}') == 1.0
-            assert query(http, "comvla_server_ready") == 1.0
+                assert eventually(lambda e=expression, t=total: value(http, e) == t), expression
+            assert value(http, 'up{job="comvla"}') == 1.0
+            assert value(http, "comvla_server_ready") == 1.0

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import math
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +98,20 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
         "--deadline-s", type=float, metavar="S", help="longest that a step may take"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the synthetic observation")
+    parser.add_argument(
+        "--repeat",
+        type=int,
+        default=1,
+        metavar="N",
+        help="send N times as one robot, 0 without end (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--every-s",
+        type=float,
+        default=0.4,
+        metavar="S",
+        help="seconds from one to the next (default: %(default)s, chunks of eight at 20 Hz)",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_link(parser)
     add_snr_source(parser)
@@ -101,7 +119,16 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Sends the observation. 0 when the cloud answered, 1 when the robot had to fall back."""
+    """Sends the observation. 0 when the cloud answered, 1 when the robot had to fall back.
+
+    Raises:
+        ObservationError: a number of times, or a pause, that cannot be.
+    """
+    if arguments.repeat < 0 or not 0.0 <= arguments.every_s < math.inf:
+        raise ObservationError(
+            f"expected --repeat and --every-s of at least 0, got {arguments.repeat} and "
+            f"{arguments.every_s}: --repeat 0 goes on until Ctrl-C"
+        )
     edge = None if _sends_pictures(arguments.uplink) else load_edge(arguments.edge)
     with (
         opened(arguments.snr_source, arguments.snr_db) as snr,
@@ -125,12 +152,26 @@ def run(arguments: argparse.Namespace) -> int:
     ):
         info = client.info
         obs = _observation(arguments, info)
-        chunk = client.step(obs, arguments.instruction)
-    if arguments.json:
-        print(json.dumps({"actions": chunk.actions.tolist(), "report": chunk.report.to_dict()}))
-    else:
-        print(_text(chunk, info))
-    return 0 if chunk.source == "cloud" else 1
+        answered = True
+        for _ in _beats(arguments.repeat, arguments.every_s):
+            chunk = client.step(obs, arguments.instruction)
+            answered &= chunk.source == "cloud"
+            if arguments.json:
+                line = {"actions": chunk.actions.tolist(), "report": chunk.report.to_dict()}
+                print(json.dumps(line), flush=True)
+            else:
+                print(_text(chunk, info), flush=True)
+    return 0 if answered else 1
+
+
+def _beats(times: int, every_s: float) -> Iterator[int]:
+    """Counts, in a steady rhythm; a beat that was missed is not made up for."""
+    due_s = time.monotonic()
+    for number in itertools.count() if times == 0 else range(times):
+        yield number
+        due_s = max(due_s + every_s, time.monotonic())
+        if number + 1 != times:
+            time.sleep(max(0.0, due_s - time.monotonic()))
 
 
 def _sends_pictures(uplink: str | None) -> bool:
