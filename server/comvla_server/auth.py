@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Protocol
 
 from comvla_server.identity import ANYBODY, IDENTITY_PATTERN, Identity
 from comvla_server.refusals import Reason, Refusal
@@ -11,6 +12,18 @@ from comvla_server.tokens import TokenFile
 HEADER = "authorization"
 
 _NAME = "x509_common_name"
+
+
+class Call(Protocol):
+    """What is known of a call before its request; gRPC's context is one."""
+
+    def invocation_metadata(self) -> Iterable[tuple[str, str | bytes]] | None:
+        """Its headers."""
+        ...
+
+    def auth_context(self) -> Mapping[str, Iterable[bytes]]:
+        """What the handshake told of its connection."""
+        ...
 
 
 class Authenticator:
@@ -29,23 +42,15 @@ class Authenticator:
         self._tokens = tokens
         self._certificates = certificates
 
-    def identify(
-        self,
-        metadata: Iterable[tuple[str, str | bytes]],
-        peer: Mapping[str, Iterable[bytes]],
-    ) -> Identity:
+    def identify(self, call: Call) -> Identity:
         """Whose call this is.
-
-        Args:
-            metadata: headers of the call.
-            peer: what the handshake told of the connection.
 
         Raises:
             Refusal: nobody's.
         """
         if self._tokens is not None:
-            return self._by_token(self._tokens, metadata)
-        return _by_certificate(peer) if self._certificates else ANYBODY
+            return self._by_token(self._tokens, call.invocation_metadata() or ())
+        return _by_certificate(call.auth_context()) if self._certificates else ANYBODY
 
     def _by_token(self, tokens: TokenFile, metadata: Iterable[tuple[str, str | bytes]]) -> Identity:
         given = [value for name, value in metadata if name == HEADER]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import logging
+import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
@@ -27,6 +28,17 @@ from comvla_server.settings import ServerSettings
 from comvla_server.wording import shown
 
 _log = logging.getLogger(__name__)
+
+if sys.version_info >= (3, 11):
+
+    async def _within(message: Awaitable[bytes], timeout_s: float) -> bytes:
+        async with asyncio.timeout(timeout_s):  # unlike wait_for, without a task of its own
+            return await message
+else:
+
+    async def _within(message: Awaitable[bytes], timeout_s: float) -> bytes:
+        return await asyncio.wait_for(message, timeout_s)
+
 
 _Context = Any  # grpc.aio.ServicerContext
 _HEALTH = f"/{health.SERVICE_NAME}/"
@@ -128,9 +140,7 @@ class Door(grpc.aio.ServerInterceptor):
         if method.startswith(_HEALTH):
             identity, ended = ANYBODY, self._begin_health_call()
         else:
-            identity = self._authenticator.identify(
-                context.invocation_metadata() or (), context.auth_context()
-            )
+            identity = self._authenticator.identify(context)
             ended = self._limits.begin(identity)
         task = asyncio.current_task()
         assert task is not None, "gRPC runs every call in a task"
@@ -145,7 +155,7 @@ class Door(grpc.aio.ServerInterceptor):
             Refusal: it takes too long, or is more than the identity may send.
         """
         try:
-            message = await asyncio.wait_for(anext(requests), self._timeout_s)
+            message = await _within(anext(requests), self._timeout_s)
         except StopAsyncIteration:
             return None
         except asyncio.TimeoutError:

@@ -115,9 +115,15 @@ class Watcher:
             self._seen[name] = stamps
             try:
                 item.reload()
-            except ComVLAError as error:
+            except Exception as error:  # whatever it is, it must not end the watch
                 self._failed(name)
-                _log.error("%s changed and cannot be used, the old one stays: %s", name, error)
+                told = isinstance(error, ComVLAError)
+                _log.error(
+                    "%s changed and cannot be used, the old one stays: %s",
+                    name,
+                    error,
+                    exc_info=not told,
+                )
             else:
                 if before is not None:
                     _log.info("%s reloaded", name)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from comvla_server import logs
+from comvla_server.descriptors import allow_descriptors
 from comvla_server.settings import ServerSettings
 from comvla_server.settings_flags import add_flags, settings_of
 
@@ -54,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """
     settings = settings_of(args).settings
     logs.configure(settings.log_format, settings.log_level)
+    allow_descriptors(settings)
     return asyncio.run(_serve(settings, lambda: load_engine(settings)))
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import ssl
+import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import grpc
@@ -78,9 +82,9 @@ class ServerTls:
         if self._client_ca is not None:
             bundle = read_certificates(self._client_ca, "tls_client_ca", now_s)
             authorities, ends_s["client_ca"] = bundle.pem, bundle.not_after_s
-        context = self._https_context()
+        context = _https_context(key, chain.pem)
         self._grpc = grpc.ssl_server_certificate_configuration([(key, chain.pem)], authorities)
-        self._https = context
+        self._https, self._pems = context, (key, chain.pem)
         for name, end_s in ends_s.items():
             self._metrics.certificate_not_after.labels(name).set(end_s)
             if end_s - now_s < _SOON_S:
@@ -96,7 +100,7 @@ class ServerTls:
 
     def https_context(self) -> ssl.SSLContext:
         """A context that hands each new connection to the current one."""
-        context = self._https_context()
+        context = _https_context(*self._pems)
         context.sni_callback = self._hand_over
         return context
 
@@ -113,14 +117,34 @@ class ServerTls:
     ) -> None:
         connection.context = self._https
 
-    def _https_context(self) -> ssl.SSLContext:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.minimum_version = ssl.TLSVersion.TLSv1_2
+
+def _https_context(key: bytes, chain: bytes) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    # Python takes paths only, and the files may have changed since their content was checked.
+    with _as_file(key + b"\n" + chain) as path:
         try:
-            context.load_cert_chain(self._certificate, self._key)
-        except (OSError, ssl.SSLError) as error:
+            context.load_cert_chain(path)
+        except ssl.SSLError as error:
             raise CertificateError(
-                f"{self._certificate} and {self._key} cannot be used together: {error}; give the "
-                "server's certificate and its own key"
+                f"the certificate and its key cannot be used for TLS: {error}; make them anew, e.g. "
+                "with the elliptic curve prime256v1"
             ) from error
-        return context
+    return context
+
+
+@contextlib.contextmanager
+def _as_file(content: bytes) -> Iterator[str]:
+    """A path under which this process can read the content; in memory where there is such a thing."""
+    if sys.platform == "linux":
+        descriptor = os.memfd_create("comvla-tls")
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            yield f"/proc/self/fd/{descriptor}"
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pair.pem"
+        path.touch(mode=0o600)
+        path.write_bytes(content)
+        yield str(path)

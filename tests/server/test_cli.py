@@ -35,7 +35,8 @@ READY = re.compile(r"comvla-server ready grpc=(\S+) admin=(http://\S+) model=(\S
 @contextlib.contextmanager
 def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A Python process that does not outlive the block."""
-    environment = {**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
+    path = os.pathsep.join((str(HERE), os.environ.get("PYTHONPATH", "")))
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(
         [sys.executable, *arguments],
         stdout=subprocess.PIPE,

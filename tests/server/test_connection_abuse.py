@@ -289,7 +289,7 @@ def test_an_oversize_message_is_refused_unread(cloud: StubCloud) -> None:
     settings = ServerSettings(max_request_bytes=64 * 1024)
     with BackgroundServer(Engine(cloud), settings) as server, Robot(server.target) as robot:
         cloud.forget()
-        for size, words in ((100_000, "a request of at most"), (10**7, "larger than max")):
+        for size, words in ((66_000, "a request of at most"), (10**7, "larger than max")):
             code, details = robot.refused(message(payload=bytes(size)))
             assert code is grpc.StatusCode.RESOURCE_EXHAUSTED
             assert words in details

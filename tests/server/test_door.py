@@ -170,6 +170,28 @@ def test_the_session_of_another_robot_is_permission_denied(robot: Robot, cloud: 
     assert list(again.actions) == list(answered.actions)
 
 
+def test_the_session_of_another_robot_is_shut_to_payloads_in_pieces_too(
+    robot: Robot, cloud: StubCloud
+) -> None:
+    def in_pieces(token: str, step: int) -> Any:
+        whole = message("mine", step)
+        payload, whole.payload = whole.payload, b""
+        head = policy_pb2.InferProgressiveHead(request=whole, window_s=5.0)
+        messages = [
+            policy_pb2.InferProgressiveRequest(head=head),
+            policy_pb2.InferProgressiveRequest(piece=payload),
+        ]
+        return robot.stub.InferProgressive.future(
+            iter(messages), timeout=PATIENCE_S, metadata=bearer(token)
+        )
+
+    assert in_pieces(ARM_7, 0).result(PATIENCE_S).response.session_id == "mine"
+    assert refusal_of(in_pieces(ARM_8, 1))[0] is PERMISSION_DENIED
+    assert refusal_of(in_pieces(new_token(), 1))[0] is UNAUTHENTICATED
+    assert in_pieces(ARM_7, 1).result(PATIENCE_S).response.step == 1
+    assert refusal_of(in_pieces(SMALL, 2))[0] is PERMISSION_DENIED
+
+
 def test_an_observation_that_waits_cannot_be_replaced_by_another_robot(
     robot: Robot, cloud: StubCloud
 ) -> None:

@@ -24,6 +24,7 @@ from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_client import AccessError, AsyncComVLAClient, ComVLAClient, TlsOptions
 from comvla_client.access import Access
 from comvla_client.transport import GrpcTransport, TransportError
+from comvla_server import cli
 from comvla_server.background import BackgroundServer
 from comvla_server.certificates import CertificateError
 from comvla_server.engine import Engine
@@ -268,6 +269,21 @@ def test_bad_files_stop_the_start_before_anything_listens(
     with pytest.raises(CertificateError, match=words):
         BackgroundServer(Engine(StubCloud()), ServerSettings(**files)).start()
     assert not any(t.name == "comvla-inference" for t in threading.enumerate())
+
+
+@pytest.mark.usefixtures("logging_as_it_was")
+def test_on_the_command_line_they_are_exit_code_two_and_one_clear_line(
+    files: dict[str, Path], authority: Authority, capfd: pytest.CaptureFixture[str]
+) -> None:
+    files["tls_key"].write_bytes(authority.issue("other").key)
+    arguments = ["serve", "--port", "0", "--admin-port", "0"]
+    for name, path in files.items():
+        arguments += ["--" + name.replace("_", "-"), str(path)]
+    assert cli.main(arguments) == 2
+    stdout, stderr = capfd.readouterr()
+    assert stdout == ""
+    assert "does not belong to the certificate" in stderr
+    assert len(stderr.splitlines()) == 1
 
 
 def test_a_new_certificate_is_shown_without_a_restart(
