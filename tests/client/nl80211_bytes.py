@@ -1,4 +1,4 @@
-"""Netlink messages of the wireless subsystem, laid out byte by byte as the kernel's nl80211.h says.
+"""Netlink messages of the wireless subsystem: recorded from a kernel, or laid out as nl80211.h says.
 
 They go through pyroute2's own decoder in the tests, as those of a kernel would.
 """
@@ -6,6 +6,7 @@ They go through pyroute2's own decoder in the tests, as those of a kernel would.
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 from typing import Any
 
 NESTED = 0x8000
@@ -13,7 +14,7 @@ GET_INTERFACE, GET_STATION, GET_SURVEY, GET_POWER_SAVE = 7, 19, 51, 62  # as the
 
 # The attributes of struct survey_info, sta_info and rate_info.
 SURVEY_FREQUENCY, SURVEY_NOISE, SURVEY_IN_USE = 1, 2, 3
-STA_INACTIVE_TIME, STA_SIGNAL, STA_TX_BITRATE, STA_SIGNAL_AVG, STA_TID_STATS = 1, 7, 8, 13, 31
+STA_INACTIVE_TIME, STA_SIGNAL, STA_TX_BITRATE, STA_SIGNAL_AVG = 1, 7, 8, 13
 RATE_BITRATE, RATE_BITRATE32 = 1, 5
 
 
@@ -41,6 +42,12 @@ def decoded(raw: bytes) -> Any:
     return parsed
 
 
+def recorded(kind: str) -> list[bytes]:
+    """What a real kernel answered: interface, station, survey or power_save."""
+    lines = Path(__file__).with_name("nl80211_linux_6_1.txt").read_text("ascii").splitlines()
+    return [bytes.fromhex(line.split()[1]) for line in lines if line.startswith(f"{kind} ")]
+
+
 def interface(index: int, name: str, kind: int = 2, width: int | None = 3) -> bytes:
     parts = [
         u32(3, index),
@@ -59,7 +66,6 @@ def station(
     average_dbm: int | None = None,
     inactive_ms: int = 12,
     rate: tuple[bytes, ...] = (),
-    with_statistics: bool = False,
 ) -> bytes:
     info = [u32(STA_INACTIVE_TIME, inactive_ms)]
     if signal_dbm is not None:
@@ -68,10 +74,6 @@ def station(
         info.append(attribute(STA_SIGNAL_AVG, struct.pack("=b", average_dbm)))
     if rate:
         info.append(attribute(STA_TX_BITRATE | NESTED, b"".join(rate)))
-    if with_statistics:  # what mac80211 adds: 17 traffic identifiers with four counters each
-        counters = b"".join(attribute(i, struct.pack("=Q", 1000 + i)) for i in range(1, 5))
-        cells = b"".join(attribute(tid | NESTED, counters) for tid in range(1, 18))
-        info.append(attribute(STA_TID_STATS | NESTED, cells))
     body = attribute(21 | NESTED, b"".join(info))
     return message(GET_STATION, u32(3, 7), attribute(6, bytes.fromhex("02aabbccddee")), body)
 

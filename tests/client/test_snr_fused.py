@@ -249,6 +249,8 @@ def test_a_cut_step_counts_what_arrived_over_the_period() -> None:
     assert evidence_of(cut, PAPER_LINK) == Evidence(
         equivalent_snr_db(600, PAPER_LINK.period_s, PAPER_LINK)
     )
+    longer = replace(cut, window_s=0.2)  # several periods' worth, or a period less its reserve
+    assert evidence_of(longer, PAPER_LINK) == Evidence(equivalent_snr_db(600, 0.2, PAPER_LINK))
 
 
 def test_a_lost_step_is_an_upper_bound_and_other_failures_say_nothing() -> None:

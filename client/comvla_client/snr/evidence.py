@@ -50,9 +50,9 @@ def evidence_of(
 
     * All tokens arrived: the framed bytes crossed in the time of the call, less the server's own
       share and an empty round trip.
-    * Some arrived: the link carried those in one period, and no more.
+    * Some arrived: the link carried those in the window that they had, and no more.
     * No answer in time: the link was slower than the bytes that were sent over the time of waiting,
-      which is a period at least; in a simulated link it passes at once. (Or the server was slow: a
+      which is that window at least; in a simulated link it passes at once. (Or the server was slow: a
       single failure is therefore taken with reserve.)
 
     Args:
@@ -63,18 +63,19 @@ def evidence_of(
     Returns:
         None where the step says nothing about the link: nothing was sent, or the server refused.
     """
+    window_s = report.window_s or link.window_s
     waited_s = report.timings_s.get("call", 0.0) - round_trip_s
     if report.framed_bytes <= 0 or report.timings_s.get("call", 0.0) <= 0.0:
         return None
     if report.source != "cloud":
         if report.fallback_reason != "deadline":
             return None
-        waited_s = max(waited_s, link.period_s)
+        waited_s = max(waited_s, window_s)
         return Evidence(equivalent_snr_db(report.framed_bytes, waited_s, link), bound=True)
     if 0 < report.tokens_used < report.tokens:
         lost_bytes = report.encoded_bytes * (1.0 - report.tokens_used / report.tokens)
         arrived_bytes = report.framed_bytes - lost_bytes
-        return Evidence(equivalent_snr_db(arrived_bytes, link.period_s, link))
+        return Evidence(equivalent_snr_db(arrived_bytes, window_s, link))
     under_way_s = waited_s - report.server_timings_s.get("total", 0.0)
     # Never less than a tenth of the call: a round trip that was given too long must not make the
     # link look infinitely fast.

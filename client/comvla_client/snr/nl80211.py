@@ -39,12 +39,14 @@ class Interface:
         index: its number in the kernel.
         kind: ``NL80211_IFTYPE_*``; 2 is a client of an access point.
         width_hz: of the channel; None while there is none.
+        frequency_mhz: of the channel's centre; None while there is none.
     """
 
     name: str
     index: int
     kind: int
-    width_hz: float | None
+    width_hz: float | None = None
+    frequency_mhz: int | None = None
 
 
 @dataclass(frozen=True)
@@ -75,12 +77,14 @@ def interfaces_in(messages: Iterable[Message]) -> list[Interface]:
         if name is None or index is None:  # a P2P device has no network interface
             continue
         width = message.get_attr("NL80211_ATTR_CHANNEL_WIDTH")
+        has_width = width is not None and width < len(_WIDTHS_MHZ)
         found.append(
             Interface(
                 name,
                 index,
                 message.get_attr("NL80211_ATTR_IFTYPE") or 0,
-                None if width is None or width >= len(_WIDTHS_MHZ) else 1e6 * _WIDTHS_MHZ[width],
+                1e6 * _WIDTHS_MHZ[width] if has_width else None,
+                message.get_attr("NL80211_ATTR_WIPHY_FREQ"),
             )
         )
     return found
@@ -96,19 +100,29 @@ def station_in(messages: Iterable[Message]) -> Station | None:
     return min(stations, key=lambda station: station.inactive_s, default=None)
 
 
-def noise_in(messages: Iterable[Message]) -> float | None:
+def noise_in(messages: Iterable[Message], frequency_mhz: int | None = None) -> float | None:
     """Noise in dBm of the channel in use, from a dump of ``NL80211_CMD_GET_SURVEY``.
 
-    None where the driver surveys no channel in use, or not its noise.
+    Args:
+        messages: one for each channel that was surveyed.
+        frequency_mhz: of the interface's channel, for drivers that mark none as in use.
+
+    Returns:
+        None where the driver does not survey that channel, or not its noise.
     """
+    mine = None
     for message in messages:
         survey = message.get_attr("NL80211_ATTR_SURVEY_INFO")
-        if survey is None or survey.get_attr("NL80211_SURVEY_INFO_IN_USE") is None:
+        if survey is None:
             continue
-        noise = survey.get_attr("NL80211_SURVEY_INFO_NOISE")
-        # The kernel's u8 holds a negative number, in two's complement.
-        return None if noise is None else float(noise - 256 if noise > 127 else noise)
-    return None
+        if survey.get_attr("NL80211_SURVEY_INFO_IN_USE") is not None:
+            mine = survey
+            break
+        if frequency_mhz == survey.get_attr("NL80211_SURVEY_INFO_FREQUENCY"):
+            mine = survey
+    noise = None if mine is None else mine.get_attr("NL80211_SURVEY_INFO_NOISE")
+    # The kernel's u8 holds a negative number, in two's complement.
+    return None if noise is None else float(noise - 256 if noise > 127 else noise)
 
 
 def thermal_noise_dbm(width_hz: float, noise_figure_db: float = 7.0) -> float:
@@ -153,12 +167,12 @@ class Nl80211:
         return interfaces_in(list(self._socket.get_interfaces_dump()))
 
     def station(self, interface: Interface) -> Station | None:
-        """Who is at the other end; None while the interface is not associated."""
+        """Who is at the other end; None while the interface is not associated, or gone."""
         return station_in(list(self._socket.get_stations(interface.index)))
 
     def noise_dbm(self, interface: Interface) -> float | None:
         """Noise in the channel in use; None where the driver does not measure it."""
-        return noise_in(list(self._socket.survey(interface.index)))
+        return noise_in(list(self._socket.survey(interface.index)), interface.frequency_mhz)
 
     def power_save(self, interface: Interface) -> bool | None:
         """Whether the card sleeps between beacons; None where the driver does not say."""

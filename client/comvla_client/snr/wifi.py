@@ -68,26 +68,23 @@ class WifiSnr(PolledSource):
     def _measure(self) -> Measurement:
         if self._socket is None:
             self._socket = Nl80211()
-        if self._interface is None:
+        station = None if self._interface is None else self._station(self._socket, self._interface)
+        if station is None:
+            # Nobody there, or no such interface: a dump tells the two apart in no kernel. After a
+            # reset the name has another index.
             self._interface = self._find(self._socket)
             if self._interface is None:
                 return Measurement(-math.inf, details={"interface": self._name, "state": "gone"})
             self._name = self._interface.name
-        try:
-            station = self._socket.station(self._interface)
-            if station is None:
-                return Measurement(-math.inf, details=self._details("not associated"))
-            noise_dbm, noise_from = self._noise(self._socket, self._interface)
-        except Exception as error:
-            if not is_gone(error):
-                raise
-            self._interface = None  # look for it anew by its name: a reset gives it another index
-            return Measurement(-math.inf, details={"interface": self._name, "state": "gone"})
+            station = self._station(self._socket, self._interface)
+        if station is None:
+            return Measurement(-math.inf, details=self._details("not associated"))
         if station.signal_dbm is None:
             raise SnrSourceError(
                 f"expected a signal strength from {self._name}, its driver reports none: use "
                 "GoodputSnr or ConstantSnr"
             )
+        noise_dbm, noise_from = self._noise(self._socket)
         return self._reading(station, station.signal_dbm, noise_dbm, noise_from)
 
     def _release(self) -> None:
@@ -126,21 +123,31 @@ class WifiSnr(PolledSource):
             raise no_interface()
         return ranked[0]
 
-    def _noise(self, socket: Nl80211, interface: Interface) -> tuple[float, str]:
+    def _station(self, socket: Nl80211, interface: Interface) -> Station | None:
+        try:
+            return socket.station(interface)
+        except Exception as error:
+            if is_gone(error):
+                return None
+            raise
+
+    def _noise(self, socket: Nl80211) -> tuple[float, str]:
         if self._noise_dbm is not None:
             return self._noise_dbm, "given"
         now_s = self._clock()
         if now_s - self._surveyed_s >= SURVEY_PERIOD_S:
             self._surveyed_s = now_s
-            self._survey_dbm = self._survey(socket, interface)
+            # The channel may be another one since the last time.
+            self._interface = self._find(socket) or self._interface
+            self._survey_dbm = self._survey(socket)
         if self._survey_dbm is not None:
             return self._survey_dbm, "survey"
-        return thermal_noise_dbm(interface.width_hz or 20e6), "bandwidth"
+        width_hz = None if self._interface is None else self._interface.width_hz
+        return thermal_noise_dbm(width_hz or 20e6), "bandwidth"
 
-    def _survey(self, socket: Nl80211, interface: Interface) -> float | None:
+    def _survey(self, socket: Nl80211) -> float | None:
+        assert self._interface is not None, "a station was heard through it"
         try:
-            return socket.noise_dbm(interface)
-        except Exception as error:
-            if is_gone(error):
-                raise
-            return None  # EOPNOTSUPP: this driver has no survey
+            return socket.noise_dbm(self._interface)
+        except Exception:  # EOPNOTSUPP: this driver has no survey
+            return None
