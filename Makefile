@@ -1,11 +1,11 @@
 # `make` lists the targets. Each sets up what it needs by itself (tools/setup.sh).
 #   PYTHON=python3.12   the Python that makes the environment (3.10 to 3.13)
 #   VENV=.venv          where the environment goes
-#   ARGS="-k codec"     handed on to the command behind demo, test, bench and train-mini
+#   ARGS="-k codec"     handed on to the command behind demo, test, bench, train-mini and libero
 
 SHELL := bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench image-check proto train-mini
+.PHONY: help demo test lint bench image-check proto train-mini libero
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -57,3 +57,7 @@ proto: ## regenerate the code of proto/comvla/v1/policy.proto
 train-mini: ## train the shipped policy from scratch (hours); resumes where it stopped
 	@tools/setup.sh sim
 	$(BIN)/comvla-sim train $(ARGS)
+
+libero: ## LIBERO's own environment: ARGS=--download for its assets, or COMVLA_LIBERO_ASSETS=FOLDER
+	@tools/setup.sh sim
+	$(BIN)/comvla-sim libero setup $(ARGS)

@@ -31,7 +31,7 @@ def add_parser(subparsers: Any) -> None:
         "source",
         nargs="?",
         default="mini",
-        help="checkpoint folder, hub repository, or mini, the shipped policy (default: mini)",
+        help="checkpoint folder, hf://owner/name on the hub, or mini, the shipped policy (default: mini)",
     )
     parser.add_argument(
         "--tokenizer", metavar="FILE", help="tokenizer.json, where a published checkpoint has none"
@@ -79,6 +79,7 @@ def describe(source: str, tokenizer: str | None = None) -> dict[str, Any]:
     from comvla_vla.checkpoints.accounting import HALVES, half_size
 
     checkpoint = open_checkpoint(source, "any", tokenizer=tokenizer)
+    checkpoint.check_content()
     config = checkpoint.config
     statistics = checkpoint.chosen_statistics(sorted(checkpoint.statistics)[0])
     info = model_info(config, checkpoint.identity(), statistics)

@@ -13,8 +13,9 @@ _DESCRIPTION = """\
 Write DST/edge for robots and DST/cloud for the server, each with only the weights that it needs.
 
 The source is a whole policy: a folder as OpenVLA-OFT and LightVLA are published (config.json,
-safetensors, action_head--*.pt, proprio_projector--*.pt, dataset_statistics.json), a hub repository,
-or a folder of this project's own format. Weights are streamed: memory holds one tensor at a time.
+safetensors, action_head--*.pt, proprio_projector--*.pt, dataset_statistics.json), a repository
+on the hub as hf://owner/name, or a folder of this project's own format. Weights are streamed: memory
+holds one tensor at a time.
 Nothing that is read is executed, and DST appears complete or not at all.
 """
 
@@ -35,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("source", metavar="SRC", help="checkpoint folder or hub repository")
+    parser.add_argument("source", metavar="SRC", help="checkpoint folder or hf://owner/name")
     parser.add_argument("destination", metavar="DST", help="new folder for edge/ and cloud/")
     parser.add_argument(
         "--check",

@@ -31,6 +31,15 @@ def test_cloud_half(capsys):
     assert "x products" in text
 
 
+def test_fewer_layers_and_processor_time(capsys):
+    arguments = ["--size", "mini", "--layers", "1", "--k", "32", "--repetitions", "3"]
+    arguments += ["--cpu-time", "--threads", "1"]
+    assert cli.main(["bench", "model", *arguments]) == 0
+    assert "seconds of processor time" in capsys.readouterr().out
+    whole = model.ModelParameters(size="mini").config.backbone.layers
+    assert model.ModelParameters(size="mini", layers=1).config.backbone.layers == 1 < whole
+
+
 def test_edge_half():
     result = model.run(model.ModelParameters(half="edge", dtype="float32", repetitions=2))
     phases = [row["name"] for row in result["rows"]]

@@ -79,7 +79,7 @@ def test_a_failure_arrives_with_its_traceback_and_the_process_lives_on() -> None
 
 def test_missing_assets_are_an_error_of_their_own() -> None:
     process = fake_process("no-assets")
-    with pytest.raises(AssetsError, match=r"scenes/table\.xml"):
+    with pytest.raises(AssetsError, match=r"lack scenes/table\.xml.*--download"):
         process.ask("reset", {"task": 0, "init_state": 0})
     process.close()
 

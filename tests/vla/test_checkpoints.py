@@ -21,6 +21,7 @@ from comvla_vla import (
     save_policy,
     split_checkpoint,
 )
+from comvla_vla.checkpoints import open_checkpoint
 from comvla_vla.presets import MINI_WORDS
 from comvla_vla.prompt import word_tokenizer
 from comvla_vla.random import unit_statistics
@@ -121,6 +122,12 @@ def _reshape(folder, name):
     save_file(tensors, folder / "model.safetensors")
 
 
+def _flip(file, at):
+    content = bytearray(file.read_bytes())
+    content[at] ^= 1
+    file.write_bytes(content)
+
+
 def _edit(folder, **changes):
     header = json.loads((folder / "config.json").read_text())
     header.update(changes)
@@ -153,8 +160,13 @@ def _edit_model(folder, **changes):
         (lambda f: (f / "config.json").write_text("[]"), "no mapping"),
         (lambda f: (f / "config.json").write_text('{"format": "comvla-1"}'), "lacks"),
         (lambda f: _edit_model(f, towers=[]), "at least one vision tower"),
-        (lambda f: _edit_model(f, views="many"), "not one that this version reads"),
+        (lambda f: _edit_model(f, views="many"), "views = 'many', expected a whole number"),
         (lambda f: _edit_model(f, prompt={"temperature": 1}), "does not know"),
+        (lambda f: _edit_model(f, control_period_s=0.06), "are not what was written"),
+        (lambda f: _edit(f, fingerprint="0" * 32), "are not what was written"),
+        (lambda f: (f / "digests.json").unlink(), "cannot read the digests"),
+        (lambda f: (f / "digests.json").write_text("{}"), "are not what was written"),
+        (lambda f: (f / "config.json").write_text("[" * 100_000), "cannot read the configuration"),
         (lambda f: (f / "tokenizer.json").write_text("{}"), "cannot read the tokenizer"),
         (lambda f: (f / "dataset_statistics.json").write_text("{}"), "no data-set statistics"),
         (
@@ -171,6 +183,52 @@ def _edit_model(folder, **changes):
 def test_damage_is_a_checkpoint_error_that_names_it(folder, damage, words):
     damage(folder)
     with pytest.raises(CheckpointError, match=words):
+        load_cloud(folder)
+
+
+def test_one_changed_number_anywhere_is_noticed(folder, tmp_path):
+    """A bit that flips on a disk or on the way changes actions and raises nothing by itself."""
+    split_checkpoint(folder, tmp_path / "split")
+    _flip(tmp_path / "split/edge/model.safetensors", -4)
+    _flip(tmp_path / "split/cloud/model.safetensors", -40_000)
+    for load, half in ((load_edge, "edge"), (load_cloud, "cloud")):
+        with pytest.raises(CheckpointError, match=r"tensor .* the weights are damaged"):
+            load(tmp_path / "split" / half)
+        assert load(tmp_path / "split" / half, verify=False).info.fingerprint
+    _flip(folder / "model.safetensors", -4)
+    with pytest.raises(CheckpointError, match=r"tensor .* the weights are damaged"):
+        split_checkpoint(folder, tmp_path / "again")
+    assert not list(tmp_path.glob("again*"))
+
+
+def test_statistics_that_were_edited_are_noticed(folder):
+    table = json.loads((folder / "dataset_statistics.json").read_text())
+    side = next(iter(table.values()))["action"]
+    bound = next(values for values in side.values() if isinstance(values[0], float))
+    bound[0] += 1e-3
+    (folder / "dataset_statistics.json").write_text(json.dumps(table))
+    with pytest.raises(CheckpointError, match="are not what was written"):
+        load_edge(folder)
+
+
+def test_a_checkpoint_without_digests_is_read_as_it_is(folder):
+    header = json.loads((folder / "config.json").read_text())
+    del header["content_sha256"]
+    (folder / "config.json").write_text(json.dumps(header))
+    (folder / "digests.json").unlink()
+    assert load_edge(folder).info.fingerprint == header["fingerprint"]
+
+
+def test_the_shipped_policy_carries_its_digests():
+    checkpoint = open_checkpoint("mini", "whole")
+    assert set(checkpoint.digests) == set(checkpoint.tensors)
+    checkpoint.check_content()
+
+
+def test_a_tokenizer_of_a_larger_vocabulary_is_refused(folder):
+    words = [f"word{chr(97 + i)}{chr(97 + j)}" for i in range(8) for j in range(8)]
+    (folder / "tokenizer.json").write_text(word_tokenizer(words).to_str())
+    with pytest.raises(CheckpointError, match="it belongs to another checkpoint"):
         load_cloud(folder)
 
 

@@ -7,6 +7,8 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -237,6 +239,13 @@ def _edit_index(folder, change):
     path.write_text(json.dumps(index))
 
 
+def _as_torchscript(path):
+    """What torch.jit.save leaves: the same archive, with code and constants beside the tensors."""
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("archive/code/__torch__.py", "class Module: ...")
+        archive.writestr("archive/constants.pkl", b"")
+
+
 def _point_at(folder, place):
     _edit_index(folder, lambda places: places.update({"projector.fc1.bias": place}))
 
@@ -262,6 +271,7 @@ DAMAGE = [
         "mapping of names to tensors",
     ),
     (lambda f: torch.save([1], f / "proprio_projector--latest_checkpoint.pt"), "mapping of names"),
+    (lambda f: _as_torchscript(f / "action_head--latest_checkpoint.pt"), "a TorchScript archive"),
     (lambda f: (f / "action_head--latest_checkpoint.pt").write_bytes(b"PK"), "cannot read"),
     (lambda f: os.truncate(f / "action_head--latest_checkpoint.pt", 900), "cannot read"),
     (lambda f: (f / "action_head--latest_checkpoint.pt").unlink(), "lacks action_head--"),
@@ -377,8 +387,8 @@ def test_hub_repositories_come_from_the_cache_with_only_one_halfs_files(publishe
     script = (
         "from comvla_vla import load_cloud, load_edge\n"
         "from comvla.errors import CheckpointError\n"
-        "print(load_edge('moojink/tiny').info.fingerprint)\n"
-        "for source in ('moojink/tiny', 'moojink/never-fetched'):\n"
+        "print(load_edge('hf://moojink/tiny').info.fingerprint)\n"
+        "for source in ('hf://moojink/tiny', 'hf://moojink/never-fetched', 'hf://moojink/tiny@v9'):\n"
         "    try:\n"
         "        load_cloud(source)\n"
         "    except CheckpointError as error:\n"
@@ -392,17 +402,19 @@ def test_hub_repositories_come_from_the_cache_with_only_one_halfs_files(publishe
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    digest, incomplete, absent = done.stdout.splitlines()
+    digest, incomplete, absent, no_revision = done.stdout.splitlines()
     assert digest == load_edge(published).info.fingerprint
     assert "lacks action_head--" in incomplete
-    assert "cannot get 'moojink/never-fetched' from the hub" in absent
+    assert "cannot get hf://moojink/never-fetched from the hub" in absent
     assert "HF_HUB_OFFLINE" in absent
+    assert "cannot get hf://moojink/tiny@v9 from the hub" in no_revision
 
 
 def test_only_the_files_that_a_half_needs_are_asked_for(published, monkeypatch):
     asked = []
 
-    def download(repo_id, allow_patterns):
+    def download(repo_id, revision, allow_patterns):
+        assert (repo_id, revision) == ("moojink/tiny", "v2")
         asked.append(set(allow_patterns))
         return str(published)
 
@@ -410,7 +422,8 @@ def test_only_the_files_that_a_half_needs_are_asked_for(published, monkeypatch):
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     index = json.loads((published / "model.safetensors.index.json").read_text())["weight_map"]
-    hub.fetch("moojink/tiny", lambda name: name == "projector.fc1.bias", ["proprio_projector--*"])
+    tiny = hub.named("hf://moojink/tiny@v2")
+    hub.fetch(tiny, lambda name: name == "projector.fc1.bias", ["proprio_projector--*"])
     weights = {pattern for pattern in asked[-1] if pattern.endswith(".safetensors")}
     assert weights == {index["projector.fc1.bias"]}
     assert "proprio_projector--*" in asked[-1]
@@ -419,13 +432,35 @@ def test_only_the_files_that_a_half_needs_are_asked_for(published, monkeypatch):
 def test_without_huggingface_hub_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(DependencyError, match="pip install huggingface_hub"):
-        load_edge("moojink/openvla-7b-oft-finetuned-libero-spatial")
+        load_edge("hf://moojink/openvla-7b-oft-finetuned-libero-spatial")
 
 
-def test_a_folder_that_is_not_there_is_not_looked_up_on_the_hub(monkeypatch):
+def test_only_what_is_marked_as_a_repository_is_looked_up_on_the_hub(monkeypatch):
+    """A mistyped path may look like owner/name: nobody's machine asks the hub for that."""
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(CheckpointError, match="is not a checkpoint folder"):
-        load_edge("/nowhere/at/all")
+    for source in ("/nowhere/at/all", "owner/name", Path("owner/name"), "hf/owner"):
+        with pytest.raises(CheckpointError, match="is not a checkpoint folder"):
+            load_edge(source)
+    with pytest.raises(CheckpointError, match="write hf://owner/name"):
+        load_edge("owner/name")
+    for source in (
+        "hf://",
+        "hf://name",
+        "hf://owner/name/model",
+        "hf://owner/../name",
+        "hf://-a/b",
+    ):
+        with pytest.raises(CheckpointError, match="write hf://owner/name"):
+            load_edge(source)
+    assert hub.named(str(Path("hf://owner/name"))) == hub.Repository("owner/name")
+
+
+def test_the_folder_of_a_split_gives_each_side_its_half(published, tmp_path):
+    split_checkpoint(published, tmp_path / "split")
+    edge, cloud = load_edge(tmp_path / "split"), load_cloud(tmp_path / "split")
+    assert edge.info == cloud.info
+    with pytest.raises(CheckpointError, match=r"holds halves of a split: name .*edge"):
+        split_checkpoint(tmp_path / "split", tmp_path / "again")
 
 
 def test_shapes_are_compared_without_reading(tmp_path):

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from comvla_vla.attention import attend
 from comvla_vla.config import BackboneConfig
 from comvla_vla.fastv import last_row_attention, surviving_rows
+from comvla_vla.linear import Linear
 from comvla_vla.options import FastV
 
 
@@ -61,8 +62,8 @@ class SelfAttention(nn.Module):
     def __init__(self, config: BackboneConfig) -> None:
         super().__init__()
         self.config = config
-        self.qkv_proj = nn.Linear(config.hidden, 3 * config.hidden, bias=False)
-        self.o_proj = nn.Linear(config.hidden, config.hidden, bias=False)
+        self.qkv_proj = Linear(config.hidden, 3 * config.hidden, bias=False)
+        self.o_proj = Linear(config.hidden, config.hidden, bias=False)
 
     def queries_keys_values(
         self, x: Tensor, cos: Tensor, sin: Tensor
@@ -99,8 +100,8 @@ class SwiGLU(nn.Module):
 
     def __init__(self, config: BackboneConfig) -> None:
         super().__init__()
-        self.gate_up_proj = nn.Linear(config.hidden, 2 * config.intermediate, bias=False)
-        self.down_proj = nn.Linear(config.intermediate, config.hidden, bias=False)
+        self.gate_up_proj = Linear(config.hidden, 2 * config.intermediate, bias=False)
+        self.down_proj = Linear(config.intermediate, config.hidden, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(R, d) to (R, d)."""

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 from comvla.errors import CheckpointError
+from comvla_vla.config_checks import check_fit, check_values
 
 
 @dataclass(frozen=True)
@@ -168,32 +169,8 @@ class ModelConfig:
     edge_pruners: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.towers:
-            raise CheckpointError(
-                "a policy needs at least one vision tower, the configuration lists none"
-            )
-        if len({(t.side, t.image_size) for t in self.towers}) != 1:
-            sides = [(t.image_size, t.side) for t in self.towers]
-            raise CheckpointError(
-                f"vision towers must share image size and grid, got (pixels, side) {sides}"
-            )
-        if self.backbone.hidden % (2 * self.backbone.heads):
-            raise CheckpointError(
-                f"backbone width {self.backbone.hidden} does not split into {self.backbone.heads} heads of even width"
-            )
-        if unknown := set(self.edge_pruners) - {"lightvla", "vla_adp"}:
-            raise CheckpointError(f"no such edge pruners: {sorted(unknown)}")
-        if self.projector.positions == "sine2d" and self.backbone.hidden % 4:
-            raise CheckpointError(
-                f"2-D sine positions need a width divisible by 4, got {self.backbone.hidden}"
-            )
-        if (
-            self.num_tokens + 3 + self.prompt.max_tokens + self.action.slots
-            > self.backbone.max_positions
-        ):
-            raise CheckpointError(
-                f"the longest sequence exceeds the backbone's {self.backbone.max_positions} positions"
-            )
+        check_values(self)
+        check_fit(self)
 
     @property
     def film(self) -> bool:
@@ -226,22 +203,22 @@ class ModelConfig:
         """Builds a configuration from :meth:`to_dict`'s mapping.
 
         Raises:
-            CheckpointError: unknown or missing keys, or values that contradict one another.
+            CheckpointError: unknown or missing keys, values out of range or that contradict one another.
         """
         try:
             return cls(
-                name=str(data["name"]),
-                views=int(data["views"]),
+                name=data["name"],
+                views=data["views"],
                 towers=tuple(_build(TowerConfig, t) for t in data["towers"]),
                 projector=_build(ProjectorConfig, data["projector"]),
                 backbone=_build(BackboneConfig, data["backbone"]),
                 action=_build(ActionConfig, data["action"]),
                 prompt=_build(PromptConfig, data["prompt"]),
                 preprocess=data.get("preprocess", "exact"),
-                control_period_s=float(data.get("control_period_s", 0.05)),
+                control_period_s=data.get("control_period_s", 0.05),
                 edge_pruners=tuple(data.get("edge_pruners", ())),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(
                 f"the model configuration is not one that this version reads: {error}; "
                 "re-export the checkpoint with this version of comvla"

@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from comvla_vla.config import ActionConfig
+from comvla_vla.linear import Linear
 
 
 class ResidualBlock(nn.Module):
@@ -13,7 +14,7 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, dim: int) -> None:
         super().__init__()
-        self.ffn = nn.Sequential(nn.LayerNorm(dim), nn.Linear(dim, dim), nn.ReLU())
+        self.ffn = nn.Sequential(nn.LayerNorm(dim), Linear(dim, dim), nn.ReLU())
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., dim) to (..., dim)."""
@@ -29,12 +30,12 @@ class ActionHead(nn.Module):
         self.config = config
         width = hidden * config.action_dim
         self.layer_norm1 = nn.LayerNorm(width)
-        self.fc1 = nn.Linear(width, config.head_hidden)
+        self.fc1 = Linear(width, config.head_hidden)
         self.mlp_resnet_blocks = nn.ModuleList(
             ResidualBlock(config.head_hidden) for _ in range(config.head_blocks)
         )
         self.layer_norm2 = nn.LayerNorm(config.head_hidden)
-        self.fc2 = nn.Linear(config.head_hidden, config.action_dim)
+        self.fc2 = Linear(config.head_hidden, config.action_dim)
 
     def forward(self, slots: Tensor) -> Tensor:
         """(B, H * A, d) hidden states to (B, H, A) normalised actions; no tanh, no clipping."""
@@ -51,8 +52,8 @@ class ProprioProjector(nn.Module):
 
     def __init__(self, proprio_dim: int, hidden: int) -> None:
         super().__init__()
-        self.fc1 = nn.Linear(proprio_dim, hidden)
-        self.fc2 = nn.Linear(hidden, hidden)
+        self.fc1 = Linear(proprio_dim, hidden)
+        self.fc2 = Linear(hidden, hidden)
 
     def forward(self, proprio: Tensor) -> Tensor:
         """(B, P) to (B, d)."""

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from comvla_vla.backbone import Backbone, Layer, RMSNorm
 from comvla_vla.config import BackboneConfig
+from comvla_vla.linear import Linear
 
 _LIGHTVLA_EPS = 1e-6
 
@@ -58,7 +59,7 @@ class QueryKey(nn.Module):
 
     def __init__(self, hidden: int) -> None:
         super().__init__()
-        self.qk_proj = nn.Linear(hidden, 2 * hidden, bias=False)
+        self.qk_proj = Linear(hidden, 2 * hidden, bias=False)
 
 
 class TextProbe(nn.Module):

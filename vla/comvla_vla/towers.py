@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from comvla_vla.config import TowerConfig
+from comvla_vla.linear import Linear
 
 
 class LayerScale(nn.Module):
@@ -32,8 +33,8 @@ class Attention(nn.Module):
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.qkv = nn.Linear(dim, 3 * dim)
-        self.proj = nn.Linear(dim, dim)
+        self.qkv = Linear(dim, 3 * dim)
+        self.proj = Linear(dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, T, dim) to (B, T, dim)."""
@@ -49,8 +50,8 @@ class Mlp(nn.Module):
 
     def __init__(self, dim: int, hidden: int) -> None:
         super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
+        self.fc1 = Linear(dim, hidden)
+        self.fc2 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., dim) to (..., dim)."""
@@ -95,8 +96,8 @@ class FilmBlock(nn.Module):
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.block = Block(config)
-        self.scale = nn.Linear(config.film_dim, config.dim)
-        self.shift = nn.Linear(config.film_dim, config.dim)
+        self.scale = Linear(config.film_dim, config.dim)
+        self.shift = Linear(config.film_dim, config.dim)
 
     def forward(self, x: Tensor, language: Tensor | None = None) -> Tensor:
         """(B, T, dim) and the mean text embedding (B, film_dim) to (B, T, dim)."""

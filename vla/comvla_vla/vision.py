@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from comvla_vla.config import ModelConfig
+from comvla_vla.linear import Linear
 from comvla_vla.towers import build_tower
 
 # Names of the towers in published checkpoints, in the order in which their features are concatenated.
@@ -55,11 +56,11 @@ class Projector(nn.Module):
         self.config = config
         dim, hidden = config.token_dim, config.backbone.hidden
         if config.projector.kind == "fused_mlp":
-            self.fc1 = nn.Linear(dim, 4 * dim)
-            self.fc2 = nn.Linear(4 * dim, hidden)
-            self.fc3 = nn.Linear(hidden, hidden)
+            self.fc1 = Linear(dim, 4 * dim)
+            self.fc2 = Linear(4 * dim, hidden)
+            self.fc3 = Linear(hidden, hidden)
         else:
-            self.fc1 = nn.Linear(dim, hidden)
+            self.fc1 = Linear(dim, hidden)
         if config.projector.norm:
             self.norm = nn.LayerNorm(hidden)
         if config.projector.positions == "sine2d":

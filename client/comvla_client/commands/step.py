@@ -52,7 +52,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
         "--edge",
         default="mini",
         metavar="SOURCE",
-        help="robot's half of the model: mini, a folder or a hub repository (default: %(default)s)",
+        help="robot's half of the model: mini, a folder or hf://owner/name (default: %(default)s)",
     )
     parser.add_argument(
         "--instruction",

@@ -68,7 +68,16 @@ def _model_options(parser: argparse.ArgumentParser) -> None:
         help="visual tokens of a request to the cloud half (512,128,64,32,16)",
     )
     parser.add_argument("--prompt-tokens", type=_at_least(1), help="of the prompt (30)")
+    parser.add_argument(
+        "--layers", type=_at_least(1), help="of the backbone, fewer for less memory (all)"
+    )
     parser.add_argument("--threads", type=_at_least(0), help="of torch (its own choice)")
+    parser.add_argument(
+        "--cpu-time",
+        action="store_true",
+        default=None,
+        help="processor seconds, for a machine that others share; with --threads 1",
+    )
     parser.add_argument(
         "--compile", action="store_true", default=None, help="the cloud half through torch.compile"
     )

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from comvla_sim.bench import environment, resident
 from comvla_sim.bench.hf_layer import hf_layer
 from comvla_sim.bench.random_weights import random_half, weight_bytes
-from comvla_sim.bench.timing import Timing, measure
+from comvla_sim.bench.timing import Clock, Timing, durations, paired_ratio
 from comvla_vla import CloudModel, CloudOptions, PolicyRequest
 from comvla_vla.backbone import Layer, rotary_tables
 from comvla_vla.config import ModelConfig
 from comvla_vla.flops import backbone_flops, non_visual_tokens
+from comvla_vla.linear import cpu_multiplies_bfloat16
 from comvla_vla.presets import mini, openvla_oft
 
 SIZES: dict[str, Callable[[], ModelConfig]] = {"7b": openvla_oft, "mini": mini}
@@ -33,7 +34,10 @@ class ModelParameters:
         device, dtype: where and in which number format. compile: through torch.compile (cloud half).
         token_budgets: K, visual tokens of a request (cloud half).
         prompt_tokens: length of the prompt, begin-of-sequence included; LIBERO's have 20 to 38.
+        layers: of the backbone, 0 for all: a few take little memory and give the same ratios.
         threads: of torch, 0 for its own choice.
+        cpu_time: seconds of processor time instead of wall time, where others share the machine; with one thread,
+            because threads that wait for one another count as busy.
         repetitions: timed calls. warm_up: calls before them. seed: of weights and tokens.
     """
 
@@ -44,10 +48,24 @@ class ModelParameters:
     compile: bool = False
     token_budgets: tuple[int, ...] = (512, 128, 64, 32, 16)
     prompt_tokens: int = 30
+    layers: int = 0
     threads: int = 0
+    cpu_time: bool = False
     repetitions: int = 3
     warm_up: int = 1
     seed: int = 0
+
+    @property
+    def config(self) -> ModelConfig:
+        """Sizes of the model."""
+        config = SIZES[self.size]()
+        layers = self.layers or config.backbone.layers
+        return replace(config, backbone=replace(config.backbone, layers=layers))
+
+    @property
+    def clock(self) -> Clock:
+        """What tells seconds."""
+        return time.process_time if self.cpu_time else time.perf_counter
 
 
 def run(parameters: ModelParameters) -> dict[str, Any]:
@@ -61,8 +79,8 @@ def run(parameters: ModelParameters) -> dict[str, Any]:
     if parameters.half == "edge":
         from comvla_sim.bench.model_edge import run_edge
 
-        return run_edge(parameters, SIZES[parameters.size]())
-    return run_cloud(parameters, SIZES[parameters.size]())
+        return run_edge(parameters, parameters.config)
+    return run_cloud(parameters, parameters.config)
 
 
 @torch.inference_mode()
@@ -92,6 +110,8 @@ def run_cloud(parameters: ModelParameters, config: ModelConfig) -> dict[str, Any
         "bench": "model",
         "environment": environment.describe(),
         "threads": torch.get_num_threads(),
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "cpu_multiplies_bfloat16": cpu_multiplies_bfloat16(),
         "parameters": asdict(parameters),
         "weight_bytes": weights,
         "resident_before_bytes": before,
@@ -122,15 +142,16 @@ def _cloud_row(model: CloudModel, parameters: ModelParameters, k: int) -> dict[s
     resident.forget_peak()
     model.predict([request])
     peak = resident.peak_bytes()
-    timings = measure(
+    found = durations(
         {
             "model": lambda: model.predict([request]),
             "products": _bare_products(model.net, k, length),
         },
         repetitions=parameters.repetitions,
         warm_up=parameters.warm_up,
+        clock=parameters.clock,
     )
-    mine, products = timings["model"], timings["products"]
+    mine, products = Timing.of(found["model"]), Timing.of(found["products"])
     flops = model.flops(k, [1] * parameters.prompt_tokens)
     return {
         "name": f"K = {k}",
@@ -138,7 +159,7 @@ def _cloud_row(model: CloudModel, parameters: ModelParameters, k: int) -> dict[s
         "sequence": length,
         **asdict(mine),
         "products_s": products.median_s,
-        "ratio_to_products": mine.median_s / products.median_s,
+        "ratio_to_products": paired_ratio(found["model"], found["products"]),
         "flops": flops,
         "backbone_flops": backbone_flops(config.backbone, length),
         "tflops_per_s": flops / mine.median_s / 1e12,
@@ -147,8 +168,11 @@ def _cloud_row(model: CloudModel, parameters: ModelParameters, k: int) -> dict[s
 
 
 def _bare_products(net: nn.Module, visual: int, length: int) -> Callable[[], None]:
-    """Every linear layer of the cloud half once, with as many rows as it really gets, and nothing in between."""
-    calls: list[tuple[Tensor, Tensor]] = []
+    """Every linear layer of the cloud half once, with as many rows as it really gets, and nothing in between.
+
+    The product is the quickest that there is here, see :mod:`comvla_vla.linear`.
+    """
+    calls: list[tuple[nn.Linear, Tensor]] = []
     for name, module in net.named_modules():
         if isinstance(module, nn.Linear):
             count = length
@@ -157,11 +181,11 @@ def _bare_products(net: nn.Module, visual: int, length: int) -> Callable[[], Non
             elif not name.startswith("backbone."):
                 count = 8 if name.startswith("action_head") else 1
             rows = torch.randn(count, module.in_features).to(module.weight)
-            calls.append((rows, module.weight))
+            calls.append((module, rows))
 
     def products() -> None:
-        for rows, weight in calls:
-            F.linear(rows, weight)
+        for linear, rows in calls:
+            linear(rows)
 
     return products
 
@@ -175,10 +199,18 @@ def _against(
     assert isinstance(layer, Layer)
     rows = torch.randn(length, config.hidden).to(model.device, model.dtype)
     cos, sin = rotary_tables(torch.arange(length, device=model.device), config, model.dtype)
-    timings: dict[str, Timing] = measure(
+    began = time.perf_counter()
+    theirs(rows)
+    quick = int(5 / (time.perf_counter() - began))
+    found = durations(
         {"ours": lambda: layer(rows, cos, sin, [length]), "theirs": lambda: theirs(rows)},
-        repetitions=max(10, parameters.repetitions),
-        warm_up=2,
+        repetitions=max(min(10, quick), parameters.repetitions),
+        warm_up=1,
+        clock=parameters.clock,
     )
-    ours, other = timings["ours"].median_s, timings["theirs"].median_s
-    return {"layer_s": ours, "hf_layer_s": other, "layer_over_hf": ours / other}
+    ours, other = Timing.of(found["ours"]).median_s, Timing.of(found["theirs"]).median_s
+    return {
+        "layer_s": ours,
+        "hf_layer_s": other,
+        "layer_over_hf": paired_ratio(found["ours"], found["theirs"]),
+    }

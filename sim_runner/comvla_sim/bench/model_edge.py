@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ from comvla_client.scoring import hard_importance
 from comvla_client.selection import select
 from comvla_sim.bench import environment, resident
 from comvla_sim.bench.random_weights import random_half, weight_bytes
-from comvla_sim.bench.timing import Timing
+from comvla_sim.bench.timing import Clock, Timing
 from comvla_vla import EdgeModel
 from comvla_vla.checkpoints.accounting import empty_half
 from comvla_vla.config import ModelConfig
@@ -53,7 +52,7 @@ def run_edge(parameters: ModelParameters, config: ModelConfig) -> dict[str, Any]
     ids = torch.arange(parameters.prompt_tokens - 1) % config.backbone.vocab
     durations_s: dict[str, list[float]] = {phase: [] for phase in PHASES}
     for repetition in range(parameters.warm_up + parameters.repetitions):
-        laps = _one_step(model, pictures, ids)
+        laps = _one_step(model, pictures, ids, parameters.clock)
         if repetition >= parameters.warm_up:
             for phase, seconds in zip(PHASES, laps, strict=True):
                 durations_s[phase].append(seconds)
@@ -90,18 +89,20 @@ def count_vision_flops(config: ModelConfig) -> int:
     return int(counter.get_total_flops())
 
 
-def _one_step(model: EdgeModel, pictures: list[Any], ids: torch.Tensor) -> list[float]:
+def _one_step(
+    model: EdgeModel, pictures: list[Any], ids: torch.Tensor, clock: Clock
+) -> list[float]:
     """Seconds of each phase."""
-    marks = [time.perf_counter()]
+    marks = [clock()]
     pixels = model.preprocess(pictures)
-    marks.append(time.perf_counter())
+    marks.append(clock())
     tokens = model.vision(pixels)
-    marks.append(time.perf_counter())
+    marks.append(clock())
     projected = model.project(tokens)
-    marks.append(time.perf_counter())
+    marks.append(clock())
     queries = model.net.queries(ids.to(model.device)).float().cpu()
     importance = hard_importance(queries, projected)
-    marks.append(time.perf_counter())
+    marks.append(clock())
     select(importance, _TOKEN_BUDGET)
-    marks.append(time.perf_counter())
+    marks.append(clock())
     return [after - before for before, after in pairwise(marks)]

@@ -78,6 +78,7 @@ def _model_conclusions(result: Mapping[str, Any]) -> list[str]:
     weights, peak = result["weight_bytes"] / 1e9, result["peak_bytes"] / 1e9
     lines = [
         "",
+        *(["seconds of processor time"] if result["parameters"]["cpu_time"] else []),
         f"weights {weights:.3f} GB, peak memory {peak:.3f} GB: {result['peak_ratio']:.2f} x",
     ]
     if "vision_flops" in result:

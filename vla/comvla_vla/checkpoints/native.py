@@ -2,7 +2,7 @@
 
 ``config.json`` holds format, half, fingerprint and model; ``model.safetensors`` names as OpenVLA-OFT publishes them,
 side modules under ``action_head.`` and ``proprio_projector.``; beside them ``dataset_statistics.json`` and
-``tokenizer.json``.
+``tokenizer.json``, and ``digests.json`` with a digest of each tensor, by which damage is noticed when a half is loaded.
 """
 
 from __future__ import annotations
@@ -10,19 +10,21 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from comvla.errors import CheckpointError
-from comvla_vla.checkpoints.opened import Checkpoint
+from comvla_vla.checkpoints.opened import CONTENT, Checkpoint
 from comvla_vla.checkpoints.tensors import open_safetensors
 from comvla_vla.config import ModelConfig
 
-CONFIG, WEIGHTS, STATISTICS, TOKENIZER = (
+CONFIG, WEIGHTS, STATISTICS, TOKENIZER, DIGESTS = (
     "config.json",
     "model.safetensors",
     "dataset_statistics.json",
     "tokenizer.json",
+    "digests.json",
 )
 FORMAT = "comvla-1"
 
@@ -46,20 +48,37 @@ def open_native(folder: Path, header: Mapping[str, Any]) -> Checkpoint:
         tokenizer=read_text(folder / TOKENIZER, "the tokenizer"),
         tensors=open_safetensors(folder / WEIGHTS),
         fingerprint=str(header["fingerprint"]),
+        header=header,
+        # Early checkpoints have neither these nor the digest over them.
+        digests=read_json(folder / DIGESTS, "the digests") if CONTENT in header else None,
     )
 
 
-def write_around(folder: Path, checkpoint: Checkpoint, half: str, digest: str) -> None:
-    """Writes everything but the weights."""
+def write_around(
+    folder: Path, checkpoint: Checkpoint, half: str, digest: str, digests: Mapping[str, str]
+) -> None:
+    """Writes everything but the weights.
+
+    Args:
+        folder: where. checkpoint: what. half: of it.
+        digest: fingerprint of the whole. digests: of the tensors that the half holds, by name.
+    """
     header = {
         "format": FORMAT,
         "half": half,
         "fingerprint": digest,
         "model": checkpoint.config.to_dict(),
     }
-    (folder / CONFIG).write_text(json.dumps(header, indent=1) + "\n")
-    (folder / STATISTICS).write_text(json.dumps(checkpoint.statistics, indent=1) + "\n")
-    (folder / TOKENIZER).write_text(checkpoint.tokenizer)
+    # Tuples become lists on disk, and what is digested has to be what will be read.
+    header = json.loads(json.dumps(header))
+    header[CONTENT] = replace(checkpoint, header=header, digests=digests).content()
+    for name, content in (
+        (CONFIG, header),
+        (STATISTICS, checkpoint.statistics),
+        (DIGESTS, dict(sorted(digests.items()))),
+    ):
+        (folder / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (folder / TOKENIZER).write_text(checkpoint.tokenizer, encoding="utf-8", newline="\n")
 
 
 def publish(partial: Path, folder: Path) -> None:
@@ -96,8 +115,8 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
         CheckpointError: unreadable, or something else.
     """
     try:
-        table = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"cannot read {what} {path}: {error}") from error
     if not isinstance(table, dict):
         raise CheckpointError(f"cannot read {what} {path}: it holds no mapping")

@@ -21,6 +21,9 @@ EMBEDDING = "language_model.model.embed_tokens."
 SHARED_PREFIXES = ("projector.", EMBEDDING)
 """Tensors that both halves read."""
 
+CONTENT = "content_sha256"
+"""Key of ``config.json`` with :meth:`Checkpoint.content`."""
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -31,7 +34,8 @@ class Checkpoint:
         config: sizes. statistics: the whole table. tokenizer: JSON text.
         tensors: everything that can be read, under published names.
         fingerprint: as stored; None where the format has none (published checkpoints).
-        header: ``config.json`` as it was read, where there is no fingerprint.
+        header: ``config.json`` as it was read.
+        digests: of each tensor, as they were when the checkpoint was written; None where it says nothing of them.
     """
 
     where: str
@@ -42,6 +46,7 @@ class Checkpoint:
     tensors: Catalogue
     fingerprint: str | None
     header: Mapping[str, Any] = field(default_factory=dict)
+    digests: Mapping[str, str] | None = None
 
     def identity(self) -> str:
         """What the handshake compares.
@@ -59,16 +64,53 @@ class Checkpoint:
         content = [dict(self.header), dict(self.statistics), digests]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
 
+    def check_content(self) -> None:
+        """Compares configuration, statistics, tokenizer and the list of digests with what was written.
+
+        Raises:
+            CheckpointError: one of them is damaged, or was edited by hand.
+        """
+        written = self.header.get(CONTENT)
+        if written is not None and written != self.content():
+            raise CheckpointError(
+                f"{self.where}: configuration, statistics, tokenizer or list of digests are not what was written: "
+                "the checkpoint is damaged or was edited by hand; copy it again, or split it again"
+            )
+
+    def content(self) -> str:
+        """Hex digest over everything but the weights, and over their digests."""
+        header = {key: value for key, value in self.header.items() if key != CONTENT}
+        content = [header, dict(self.statistics), self.tokenizer, dict(self.digests or {})]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def check_digest(self, name: str, digest: str) -> None:
+        """Compares the digest of a tensor that was read with that of what was written.
+
+        Raises:
+            CheckpointError: it differs.
+        """
+        if self.digests is not None and self.digests.get(name) != digest:
+            raise CheckpointError(
+                f"{self.where}: tensor {name} is not what was written: the weights are damaged; copy the checkpoint "
+                "again, or split it again"
+            )
+
     def prompt(self) -> Prompt:
         """The tokenizer, ready to use.
 
         Raises:
-            CheckpointError: it is not one that the ``tokenizers`` library reads.
+            CheckpointError: it is not one that the ``tokenizers`` library reads, or it belongs to another vocabulary.
         """
         try:
             tokenizer = Tokenizer.from_str(self.tokenizer)
         except Exception as error:  # tokenizers raises bare Exception
             raise CheckpointError(f"cannot read the tokenizer of {self.where}: {error}") from error
+        largest, vocab = max(tokenizer.get_vocab().values(), default=0), self.config.backbone.vocab
+        if largest >= vocab:
+            raise CheckpointError(
+                f"the tokenizer of {self.where} has ids up to {largest}, the model embeds {vocab}: it belongs to "
+                "another checkpoint"
+            )
         return Prompt(self.config.prompt, tokenizer)
 
     def chosen_statistics(self, key: str | None) -> Statistics:

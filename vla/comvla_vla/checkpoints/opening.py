@@ -52,7 +52,9 @@ def open_checkpoint(
     """Opens a policy or one half of it and accounts for its tensors; no weight is read yet.
 
     Args:
-        source: a folder of this project's or the published format, a hub repository, or ``"mini"``.
+        source: a folder of this project's or the published format, the folder of a split (its ``edge`` or ``cloud``
+            is taken, whichever ``part`` says), a repository on the hub as ``"hf://owner/name"`` or
+            ``"hf://owner/name@revision"``, or ``"mini"``.
         part: what it is needed for.
         recipe: of a published checkpoint.
         tokenizer: a ``tokenizer.json``, where the folder has none.
@@ -63,7 +65,7 @@ def open_checkpoint(
         DependencyError: a hub repository, and huggingface_hub is not installed.
     """
     folder, fetched = _locate(source, part)
-    weights = _weights_folder(folder, base, part)
+    weights = _weights_folder(folder, base, part, from_hub=hub.named(str(source)) is not None)
     path = (folder if (folder / CONFIG).is_file() else weights) / CONFIG
     header = read_json(path, "the configuration")
     if header.get("format") == FORMAT:
@@ -85,30 +87,39 @@ def open_checkpoint(
     return checkpoint
 
 
-def locate(source: str | Path) -> Path:
+def locate(source: str | Path, part: Part = "any") -> Path:
     """Folder of a checkpoint on this machine: a path, or the name of a shipped policy.
+
+    Args:
+        source: the folder, or that of a split, whose ``part`` is then taken.
+        part: what it is needed for.
 
     Raises:
         CheckpointError: no such folder.
     """
     if str(source) == "mini":
-        folder = Path(str(files("comvla_vla") / "policies" / "mini"))
-    else:
-        folder = Path(source).expanduser()
-    if not (folder / CONFIG).is_file() and lora.find_adapter(folder) is None:
-        raise CheckpointError(
-            f"{source!s} is not a checkpoint folder: {folder / CONFIG} does not exist"
-        )
-    return folder
+        return Path(str(files("comvla_vla") / "policies" / "mini"))
+    folder = Path(source).expanduser()
+    if (folder / CONFIG).is_file() or lora.find_adapter(folder) is not None:
+        return folder
+    halves = [half for half in ("edge", "cloud") if (folder / half / CONFIG).is_file()]
+    if part in halves:
+        return folder / part
+    if halves:
+        raise CheckpointError(f"{source!s} holds halves of a split: name {folder / halves[0]}")
+    raise CheckpointError(
+        f"{source!s} is not a checkpoint folder: {folder / CONFIG} does not exist"
+        f"{hub.remedy(str(source))}"
+    )
 
 
 def _locate(source: str | Path, part: Part) -> tuple[Path, Half | None]:
     """The folder, and the half whose files alone were fetched into it (None: everything is there)."""
-    name = str(source)
-    if name == "mini" or Path(name).expanduser().exists() or not hub.looks_like_repository(name):
-        return locate(source), None
+    repository = hub.named(str(source))
+    if repository is None:
+        return locate(source, part), None
     half = part if part in ("edge", "cloud") else None
-    return hub.fetch(name, _wanted(half), _SIDE_FILES[part]), half
+    return hub.fetch(repository, _wanted(half), _SIDE_FILES[part]), half
 
 
 def _wanted(half: Half | None) -> Callable[[str], bool] | None:
@@ -119,16 +130,20 @@ def _wanted(half: Half | None) -> Callable[[str], bool] | None:
     return lambda name: name.startswith(prefixes)
 
 
-def _weights_folder(folder: Path, base: str | Path | None, part: Part) -> Path:
+def _weights_folder(folder: Path, base: str | Path | None, part: Part, *, from_hub: bool) -> Path:
     """Where the main weights are: here, or in the checkpoint that an unmerged adapter belongs to."""
     adapter = lora.find_adapter(folder)
     if adapter is None or (folder / WEIGHTS).is_file() or (folder / INDEX).is_file():
         return folder
     if base is None:
         base = lora.read_adapter_config(adapter).get("base_model_name_or_path")
+        if base and not Path(str(base)).expanduser().exists():
+            # A file in a folder must not send anybody to the hub; a repository that was asked for may.
+            base = f"{hub.PREFIX}{base}" if from_hub else None
     if not base:
         raise CheckpointError(
-            f"{folder} holds an adapter without the weights it belongs to: name their checkpoint (base=, --base)"
+            f"{folder} holds an adapter without the weights it belongs to: name their checkpoint (base=, --base), "
+            f"a folder or {hub.PREFIX}owner/name"
         )
     return _locate(base, part)[0]
 

@@ -81,7 +81,14 @@ def published_config(header: Mapping[str, Any], tensors: Catalogue, recipe: Reci
     try:
         backbone = _backbone(header["text_config"])
         towers = _towers(header)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        IndexError,
+        AttributeError,
+        OverflowError,
+    ) as error:
         raise CheckpointError(
             f"config.json is not one of OpenVLA-OFT: {error!r}; copy the checkpoint again"
         ) from error

@@ -9,7 +9,7 @@ from typing import Any
 
 from tokenizers import Tokenizer
 
-from comvla_vla.checkpoints.identity import fingerprint
+from comvla_vla.checkpoints.identity import combine, tensor_digest
 from comvla_vla.checkpoints.native import WEIGHTS, publish, write_around
 from comvla_vla.checkpoints.opened import Checkpoint
 from comvla_vla.checkpoints.safetensors_writer import SafetensorsWriter, file_order
@@ -27,7 +27,8 @@ def save_policy(
 ) -> str:
     """Writes a whole policy; returns its fingerprint. The folder appears complete or not at all."""
     tensors = {**to_published(edge), **to_published(cloud)}
-    digest = fingerprint(cloud.config, tensors, statistics)
+    digests = {name: tensor_digest(tensor) for name, tensor in tensors.items()}
+    digest = combine(cloud.config, statistics, digests)
     entries = from_memory(tensors, folder / WEIGHTS)
     checkpoint = Checkpoint(
         where=str(folder),
@@ -45,7 +46,7 @@ def save_policy(
         with SafetensorsWriter(partial / WEIGHTS, entries) as writer:
             for name in file_order(entries):
                 writer.write(name, tensors[name].cpu())
-        write_around(partial, checkpoint, "whole", digest)
+        write_around(partial, checkpoint, "whole", digest, digests)
         publish(partial, folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

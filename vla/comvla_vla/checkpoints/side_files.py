@@ -6,6 +6,7 @@ They are pickles. ``torch.load(weights_only=True)`` refuses everything but tenso
 from __future__ import annotations
 
 import pickle
+import zipfile
 from pathlib import Path
 
 import torch
@@ -34,12 +35,27 @@ def find_side_file(folder: Path, module: str) -> Path | None:
     return found[0] if found else None
 
 
+def _is_torchscript(path: Path) -> bool:
+    """Whether a file is what torch.jit.save writes: a ZIP archive with constants.pkl or code beside its tensors."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            inside = [name.partition("/")[2] for name in archive.namelist()]
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+        return False  # torch says what else is wrong with it
+    return any(name == "constants.pkl" or name.startswith("code/") for name in inside)
+
+
 def open_side_file(path: Path, prefix: str) -> dict[str, TensorEntry]:
     """Catalogue of one side file, names prefixed and without the ``module.`` of distributed training.
 
     Raises:
         CheckpointError: not a file of named tensors, and nothing else, that torch reads safely.
     """
+    if _is_torchscript(path):
+        raise CheckpointError(
+            f"{path} is a TorchScript archive, which holds code, and was not opened: export the module's "
+            "state_dict alone with torch.save"
+        )
     try:
         table = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +53,7 @@ def split_checkpoint(
     Memory holds one tensor at a time, each is read once, and the destination appears complete or not at all.
 
     Args:
-        source: a whole policy of this project's or the published format, or a hub repository.
+        source: a whole policy of this project's or the published format, or ``hf://owner/name``.
         destination: a folder that does not exist yet.
         recipe, tokenizer, base: of a published checkpoint, see :func:`~comvla_vla.checkpoints.open_checkpoint`.
         progress: told (bytes done, bytes in all) after each tensor.
@@ -69,6 +69,7 @@ def split_checkpoint(
     checkpoint = open_checkpoint(source, "whole", recipe, tokenizer, base)
     # Before hours of copying: what would not load must not be written.
     checkpoint.prompt()
+    checkpoint.check_content()
     parts = {half: _part(checkpoint, half) for half in HALVES}
     target.parent.mkdir(parents=True, exist_ok=True)
     need = sum(total_bytes(p.tensors.values()) for p in parts.values()) + _SMALL_FILES_BYTES
@@ -78,9 +79,11 @@ def split_checkpoint(
     try:
         for half in HALVES:
             (partial / half).mkdir(parents=True)
-        digest = _write_weights(checkpoint, parts, partial, progress)
-        for half in HALVES:
-            write_around(partial / half, checkpoint, half, digest)
+        digests = _write_weights(checkpoint, parts, partial, progress)
+        digest = _fingerprint(checkpoint, digests)
+        for half, part in parts.items():
+            of_half = {name: digests[name] for name in part.tensors}
+            write_around(partial / half, checkpoint, half, digest, of_half)
         publish(partial, target)
     except OSError as error:
         raise CheckpointError(f"cannot write {partial}: {error}") from error
@@ -110,6 +113,7 @@ def check_split(
     parts: dict[Half, Checkpoint] = {}
     for half in HALVES:
         part = parts[half] = open_checkpoint(Path(destination) / half, half)
+        part.check_content()
         for what in ("config", "statistics", "tokenizer"):
             if getattr(part, what) != getattr(checkpoint, what):
                 raise CheckpointError(
@@ -122,11 +126,14 @@ def check_split(
         tensor = checkpoint.tensors[name].read()
         digests[name] = tensor_digest(tensor)
         for part in parts.values():
-            if name in part.tensors and tensor_digest(part.tensors[name].read()) != digests[name]:
+            if name not in part.tensors:
+                continue
+            if tensor_digest(part.tensors[name].read()) != digests[name]:
                 raise CheckpointError(
                     f"{part.where}: tensor {name} differs from {checkpoint.where}: split it again"
                 )
-    digest = checkpoint.fingerprint or combine(checkpoint.config, checkpoint.statistics, digests)
+            part.check_digest(name, digests[name])
+    digest = _fingerprint(checkpoint, digests)
     for part in parts.values():
         if part.fingerprint != digest:
             raise CheckpointError(
@@ -175,8 +182,8 @@ def _write_weights(
     parts: dict[Half, Checkpoint],
     folder: Path,
     progress: Callable[[int, int], None] | None,
-) -> str:
-    """Streams all weights into the files of both halves; returns the fingerprint."""
+) -> dict[str, str]:
+    """Streams all weights into the files of both halves; returns their digests by name."""
     names = _needed(parts)
     whole = sum(checkpoint.tensors[name].nbytes for name in names)
     digests, done = {}, 0
@@ -188,12 +195,18 @@ def _write_weights(
         for name in names:
             tensor = checkpoint.tensors[name].read()
             digests[name] = tensor_digest(tensor)
+            checkpoint.check_digest(name, digests[name])
             for half, part in parts.items():
                 if name in part.tensors:
                     writers[half].write(name, tensor)
             done += checkpoint.tensors[name].nbytes
             if progress is not None:
                 progress(done, whole)
+    return digests
+
+
+def _fingerprint(checkpoint: Checkpoint, digests: Mapping[str, str]) -> str:
+    """As stored, else over configuration, statistics and all weights."""
     return checkpoint.fingerprint or combine(checkpoint.config, checkpoint.statistics, digests)
 
 

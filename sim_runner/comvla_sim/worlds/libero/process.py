@@ -173,7 +173,10 @@ class SimulatorProcess:
     def _raise_failure(self, answer: Message) -> None:
         fields = answer.fields
         if fields.get("type") == "assets":
-            raise AssetsError(str(fields.get("message")))
+            raise AssetsError(
+                f"the assets lack {fields.get('message')}, which this suite needs: "
+                "`comvla-sim libero setup --download` gets all of them"
+            )
         raise LiberoError(
             f"the simulator failed: {fields.get('message')}\n{fields.get('traceback', '')}"
         )

@@ -200,4 +200,7 @@ def _missing_asset(error: Exception, assets: str) -> str | None:
     if isinstance(error, FileNotFoundError) and str(named).startswith(assets):
         return os.path.relpath(str(named), assets)
     text = str(error)
-    return text if assets in text and "rror opening file" in text else None
+    if "rror opening file" not in text or assets not in text:
+        return None
+    # MuJoCo: Error opening file '/folder/of/assets/textures/wood.png'
+    return text[text.index(assets) + len(assets) :].split("'")[0].strip("/\n ")
