@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -120,11 +121,13 @@ class Decoding:
                 f"{self._most_waiting}: ask less often, send smaller pictures, or add a replica",
             )
 
+        context = contextvars.copy_context()  # decoders may ask who calls
+
         def in_time() -> _T:
             # Whoever waited in line until nobody waits for the answer costs nothing.
             if self._clock() >= deadline_s:
                 raise _too_late()
-            return read()
+            return context.run(read)
 
         self._waiting += 1
         job = asyncio.ensure_future(self._thread.run(in_time))

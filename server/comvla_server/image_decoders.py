@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from comvla.errors import CodecError, DependencyError, KeyFrameNeededError
 from comvla.images import stills, video
 from comvla.v1.policy_pb2 import InferRequest
+from comvla_server.identity import caller
 
 Picture: TypeAlias = NDArray[np.uint8]
 
@@ -77,7 +78,9 @@ class _Streams:
 
 
 class VideoDecoder:
-    """Every view an H.264 stream, held from step to step for each session.
+    """Every view an H.264 stream, held from step to step for each session of each identity.
+
+    A picture must never build on one that somebody else sent, so the identity is part of the name.
 
     Args:
         max_sessions: robots whose streams are held at once.
@@ -89,11 +92,11 @@ class VideoDecoder:
     def __init__(self, max_sessions: int = MAX_VIDEO_SESSIONS) -> None:
         video.require_video()
         self._max_sessions = max_sessions
-        self._held: OrderedDict[str, _Streams] = OrderedDict()
+        self._held: OrderedDict[tuple[str, str], _Streams] = OrderedDict()
 
     def decode(self, request: InferRequest) -> list[Picture]:
         """The pictures of all views. A repeat of the last step is answered without decoding it again."""
-        images, session = request.images, request.session_id
+        images, session = request.images, (caller().name, request.session_id)
         sizes = [(view.height, view.width) for view in images.views]
         digest = hashlib.blake2b(images.SerializeToString(deterministic=True)).digest()
         held = self._held.get(session)

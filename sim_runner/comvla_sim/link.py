@@ -189,6 +189,8 @@ class EnforcedLink:
             TransportError: ``DEADLINE_EXCEEDED`` when no token arrived whole in time, and whatever
                 the wrapped transport raises.
         """
+        if request.HasField("images"):
+            return self._infer_pictures(request, timeout_s, window_s)
         length = len(request.payload)
         offered_bytes = self._cost_bytes(request, length)
         header = codec.read_header(request.payload)
@@ -210,6 +212,22 @@ class EnforcedLink:
             arrived.CopyFrom(request)
             arrived.payload = request.payload[:kept_bytes]
             request = arrived
+        return self._transport.infer(request, timeout_s)
+
+    def _infer_pictures(
+        self, request: InferRequest, timeout_s: float, window_s: float
+    ) -> InferResponse:
+        """Carries pictures whole or not at all: half a file shows nothing."""
+        offered_bytes = request.images.ByteSize()
+        if self._count == "framed":
+            offered_bytes = codec.wire_bytes(request.ByteSize()) + codec.CALL_HEADERS_BYTES
+        periods = self._patience_periods if self._mode == "queue" else self._span(window_s)
+        asked = _Asked(self)
+        carried_bytes = self._radio.carry(offered_bytes, periods)
+        self._radio.give_up()
+        self._note(asked, offered_bytes, carried_bytes, 0, 0)
+        if carried_bytes < offered_bytes:
+            raise self._lost(asked, offered_bytes, carried_bytes, "no picture is of use in part")
         return self._transport.infer(request, timeout_s)
 
     def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:

@@ -91,7 +91,9 @@ def test_a_damaged_file_is_refused(coding: str, damage: str) -> None:
         decode_still(coding, file, 48, 64)
 
 
-@pytest.mark.parametrize("damage", set(damaged(b"  ")) - {"one byte short", "something behind it"})
+@pytest.mark.parametrize(
+    "damage", sorted(set(damaged(b"  ")) - {"one byte short", "something behind it"})
+)
 def test_a_damaged_access_unit_is_refused(damage: str) -> None:
     """What is stuffed behind the last slice cannot be told from it: its length alone is bounded."""
     file = damaged(VideoWriter(48, 64).write(scene()))[damage]

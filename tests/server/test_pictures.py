@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextvars
 import re
 import threading
+import time
 import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,14 +17,17 @@ import numpy as np
 import pytest
 from server_stubs import STUB_INFO, Robot, StubCloud, message, stub_actions
 
-from comvla.errors import HandshakeError
+from comvla.errors import CheckpointError, HandshakeError, KeyFrameNeededError
 from comvla.images import coding_number
 from comvla.images.stills import encode_still
 from comvla.images.video import VideoWriter
 from comvla.v1 import policy_pb2
 from comvla_server.background import BackgroundServer
+from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
+from comvla_server.identity import Identity, caller, set_caller
 from comvla_server.image_decoders import VideoDecoder, available_decoders
+from comvla_server.inference_thread import InferenceThread
 from comvla_server.settings import ServerSettings
 from comvla_server.vision import VisionHalf
 from comvla_vla import CloudModel, EdgeModel, ImageRequest, PolicyRequest, random_policy
@@ -355,6 +360,29 @@ class TestVideo:
             assert robot.infer(self.request(1, units[1], 0)).tokens_used == 16
             assert robot.infer(self.request(2, units[2], 1)).tokens_used == 16
 
+    def test_nobody_builds_on_the_pictures_of_another_identity(self) -> None:
+        """Even under a session's right name and step: the picture that steers a robot is its own."""
+        decoder, units = VideoDecoder(), self.units(2)
+
+        def as_robot(name: str, request: Any) -> Any:
+            context = contextvars.copy_context()
+            context.run(set_caller, Identity(name))
+            return context.run(decoder.decode, request)
+
+        as_robot("left", self.request(0, units[0], None))
+        with pytest.raises(KeyFrameNeededError):
+            as_robot("right", self.request(1, units[1], 0))
+        as_robot("right", self.request(0, VideoWriter(SIDE, SIDE).write(255 - scene()), None))
+        (picture,) = as_robot("left", self.request(1, units[1], 0))
+        assert np.abs(picture.astype(int) - scene(1)).mean() < 20
+
+    async def test_decoders_know_who_calls(self) -> None:
+        thread = InferenceThread("test")
+        set_caller(Identity("left"))
+        decoding = Decoding(thread, 4)
+        assert await decoding.run(caller, time.monotonic() + 60) == Identity("left")
+        assert thread.close(60)
+
     def test_the_least_recently_seen_stream_leaves_first(self) -> None:
         with serving(StubVision({"h264": VideoDecoder(max_sessions=2)})) as (robot, _, _):
             units = self.units(2)
@@ -405,10 +433,15 @@ def test_a_whole_checkpoint_is_served_with_vision_and_a_half_without(tmp_path: A
     from comvla_server.serve_command import load_engine
     from comvla_vla import split_checkpoint
 
-    assert "jpeg" in load_engine("mini", "cpu", "float32", None).image_codings
-    assert not load_engine("mini", "cpu", "float32", None, vision="off").image_codings
+    def codings(model: str, vision: str = "auto") -> tuple[str, ...]:
+        return load_engine(ServerSettings(model=model, vision=vision)).image_codings
+
+    assert "jpeg" in codings("mini")
+    assert not codings("mini", "off")
     split_checkpoint("mini", tmp_path / "split")
-    assert not load_engine(str(tmp_path / "split" / "cloud"), "cpu", "float32", None).image_codings
+    assert not codings(str(tmp_path / "split" / "cloud"))
+    with pytest.raises(CheckpointError, match="edge half was asked for"):
+        codings(str(tmp_path / "split" / "cloud"), "on")
 
 
 def test_vision_shares_what_stands_in_both_halves() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -221,3 +222,29 @@ def test_senseless_links_are_refused() -> None:
     link.advance()
     with pytest.raises(LinkError, match="ends before period 2"):
         link.advance()
+
+
+@pytest.mark.parametrize("mode", ["prefix", "drop", "queue"])
+@pytest.mark.parametrize("count", ["framed", "encoded"])
+def test_pictures_cross_whole_or_not_at_all(mode: Any, count: Any) -> None:
+    """One byte too many in the period, and nothing of it is of use."""
+    request = request_of(1)
+    request.payload = b""
+    request.images.views.add(data=bytes(900), height=16, width=16)
+    cost = wire_bytes(request) if count == "framed" else request.images.ByteSize()
+    for room_bytes in (cost, cost - 1):
+        # At 0 dB a link carries W · T · η bits a period.
+        link = LinkProfile(bandwidth_hz=8 * room_bytes / 0.05, period_s=0.05, efficiency=1.0)
+        receiver = Receiver()
+        radio = EnforcedLink(
+            receiver, ConstantChannel(0.0), link, mode=mode, count=count, patience_periods=1
+        )
+        if room_bytes == cost:
+            radio.infer(request, 1.0)
+            assert receiver.arrived == [request]
+        else:
+            with pytest.raises(TransportError, match="no picture is of use in part"):
+                radio.infer(request, 1.0)
+            assert not receiver.arrived
+        assert radio.log[-1].offered_bytes == cost
+        assert radio.log[-1].delivered_bytes == min(cost, room_bytes)

@@ -190,3 +190,36 @@ def test_both_halves_hold_what_the_checkpoint_holds(reference):
     for name, value in load_file(published / "model.safetensors").items():
         if name in tensors:
             assert torch.equal(tensors[name], value.float()), name
+
+
+def chosen(name, edge, inputs, **options):
+    """What a selector of the client sends of the reference's observation."""
+    from comvla_client.pruners import VLAADP, LightVLA
+    from comvla_client.selection import ScoringContext
+
+    tokens = edge.vision(pixels_of(inputs))
+    context = ScoringContext(
+        tokens=tokens,
+        projected=edge.project(tokens),
+        queries=edge.text_queries(INSTRUCTION),
+        grid=edge.info.grid,
+        rng=np.random.default_rng(0),
+        edge=edge,
+        instruction=INSTRUCTION,
+        proprio=inputs["state_raw"],
+    )
+    return {"lightvla": LightVLA, "vla_adp": VLAADP}[name](**options).rank(context)
+
+
+def test_the_selector_lightvla_sends_what_its_authors_code_keeps(reference, inputs):
+    _, edge, _ = reference("lightvla")
+    want = golden("golden_lightvla_fp32")["pruner_keep_idx"]
+    np.testing.assert_array_equal(np.sort(chosen("lightvla", edge, inputs)), want)
+
+
+@pytest.mark.parametrize("ratio", ["0.75", "0.3"])
+def test_the_selector_vla_adp_sends_what_its_authors_code_keeps(reference, inputs, ratio):
+    _, edge, _ = reference("oft")
+    want = golden("golden_adp_fp32")[f"L0_r{ratio}/keep_idx"]
+    kept = chosen("vla_adp", edge, inputs, ratio=float(ratio))
+    np.testing.assert_array_equal(np.sort(kept), want)
