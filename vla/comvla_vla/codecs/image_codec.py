@@ -147,7 +147,7 @@ class ImageCodec(nn.Module):
             gain: (n,) complex. noise: (n,) N0 (:mod:`comvla_vla.codecs.analogue`).
         """
         equalised = equalise_mmse(received, gain, noise)
-        return self.decode(equalised, size, clipped_snr_db(gain, noise))
+        return self.decode(equalised, size, told_snr_db(instantaneous_snr_db(gain, noise)))
 
     def forward(
         self,
@@ -162,7 +162,7 @@ class ImageCodec(nn.Module):
             images: (n, 3, H, W) float in [0, 1].
             gain: (n,) complex. noise: (n,) N0. generator: of the noise.
         """
-        symbols = self.encode(images, clipped_snr_db(gain, noise))
+        symbols = self.encode(images, told_snr_db(instantaneous_snr_db(gain, noise)))
         height, width = images.shape[-2:]
         return self.receive(transmit(symbols, gain, noise, generator), (height, width), gain, noise)
 
@@ -171,9 +171,31 @@ SNR_RANGE_DB = (-10.0, 30.0)
 """What networks are told about the SNR stays within; a deep fade is told as its lower end."""
 
 
-def clipped_snr_db(gain: Tensor, noise: Tensor) -> Tensor:
-    """(n,) the period's SNR in dB, as the networks are told."""
-    return instantaneous_snr_db(gain, noise).clamp(*SNR_RANGE_DB)
+def told_snr_db(snr_db: Tensor) -> Tensor:
+    """SNRs in dB as the networks are told."""
+    return snr_db.clamp(*SNR_RANGE_DB)
+
+
+def codec_flops(config: CodecConfig, height: int, width: int) -> tuple[int, int]:
+    """Multiply-adds counted twice of encoder and decoder for one picture.
+
+    Matrix products and convolutions, as torch counts them; nothing is computed.
+    """
+    from torch.utils.flop_counter import FlopCounterMode
+
+    check_size(config, height, width)
+    counts = []
+    with torch.device("meta"):
+        codec, snr = ImageCodec(config), torch.zeros(1)
+        latent = torch.zeros(1, *config.latent_shape(height, width))
+        for half, value in (
+            (codec.encoder, torch.zeros(1, 3, height, width)),
+            (codec.decoder, latent),
+        ):
+            with FlopCounterMode(display=False) as counter:
+                half(value, snr)
+            counts.append(counter.get_total_flops())
+    return counts[0], counts[1]
 
 
 def config_to_json(config: CodecConfig) -> dict[str, Any]:
