@@ -16,7 +16,8 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from comvla.errors import ComVLAError
-from comvla_client.image_forms import IMAGE_FORMS, make_image_form, split_name
+from comvla_client.image_forms import IMAGE_FORMS as IMAGE_FORMS  # a part of this table
+from comvla_client.image_forms import make_image_form, split_name
 from comvla_client.pruners import VLAADP, LightVLA, MotionGate
 from comvla_client.selection import (
     FullTransmission,

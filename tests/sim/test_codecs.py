@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import comvla_vla.codecs
 from comvla_sim import cli
 from comvla_sim.codecs.digital import QUALITIES, jpeg_ladder
 from comvla_sim.codecs.fading import RICIAN_K, draw_gains
@@ -19,7 +21,8 @@ from comvla_sim.codecs.measuring import curves, reconstruct
 from comvla_sim.codecs.pictures import Pictures
 from comvla_sim.codecs.trainer import CodecRecipe, CodecTrainer, draw_periods
 from comvla_sim.training.run_state import TrainingError
-from comvla_vla.codecs import rate
+from comvla_sim.worlds import make
+from comvla_vla.codecs import CODECS, load_codec, rate
 from comvla_vla.codecs.files import TrainedCodec
 from comvla_vla.codecs.image_codec import config_to_json
 from comvla_vla.codecs.witt import WITTConfig
@@ -265,3 +268,47 @@ def test_options_that_make_no_sense_are_refused_before_any_work(options, words, 
     assert cli.main(["train", "codec", *options, "--out", str(tmp_path)]) == 2
     assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- what is shipped
+
+
+@pytest.fixture(scope="module")
+def tables():
+    """Pictures of tables that neither training nor the measured curves saw, in the midst of motion."""
+    world = make("tabletop", image_size=128)
+    seen = []
+    for seed in range(990_000, 990_004):
+        world.reset(seed=seed)
+        for _ in range(25):
+            world.advance(world.expert_action())
+        seen.extend(world.observe()["images"])
+    world.close()
+    return np.stack(seen)
+
+
+@pytest.mark.simulator
+@pytest.mark.parametrize("name", CODECS)
+def test_a_shipped_codec_keeps_its_promise_on_new_tables(name, tables):
+    trained = load_codec(name)
+    lines = curves(trained.codec, tables, ("awgn",), (-5.0, 0.0, 5.0, 10.0, 15.0, 20.0))
+    ratios = {line["mean_snr_db"]: line["psnr_db"] for line in lines}
+    assert list(ratios.values()) == sorted(ratios.values())
+    assert ratios[10.0] >= 24.0
+    promised = {
+        line["mean_snr_db"]: line["psnr_db"]
+        for line in trained.notes["curves"]
+        if line["channel"] == "awgn"
+    }
+    assert ratios[10.0] == pytest.approx(promised[10.0], abs=1.5)
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_a_shipped_codec_is_small_and_its_card_says_what_was_measured(name):
+    trained = load_codec(name)
+    folder = Path(comvla_vla.codecs.__file__).parent / "shipped"
+    assert sum(f.stat().st_size for f in folder.rglob("*.safetensors")) < 1.3e6
+    card = (folder / "README.md").read_text(encoding="utf-8")
+    assert trained.fingerprint[:16] in card
+    for line in trained.notes["curves"]:
+        assert f"{line['psnr_db']:.1f} / {line['ssim']:.3f}" in card, (name, line)

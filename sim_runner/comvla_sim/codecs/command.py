@@ -52,7 +52,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--held-out-layouts", type=int, default=40, help="tables to measure on (40)", metavar="N"
     )
-    parser.add_argument("--steps", type=int, default=3000, help="optimiser steps (3000)")
+    parser.add_argument("--steps", type=int, help="optimiser steps (deepjscc 3000, witt 1500)")
     parser.add_argument("--batch-size", type=int, help="pictures per step (deepjscc 8, witt 4)")
     parser.add_argument("--learning-rate", type=float, default=1e-3, help="highest (0.001)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (0)")
@@ -62,6 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
+_STEPS = {"deepjscc": 3000, "witt": 1500}
 _BATCH_SIZE = {"deepjscc": 8, "witt": 4}  # about the same time per step
 _MEASURED_PICTURES = 128
 _SHOWN_PICTURES = 2
@@ -77,13 +78,14 @@ def run(args: argparse.Namespace) -> int:
     from comvla_sim.training.run_state import TrainingError
     from comvla_vla.codecs.image_codec import CODECS, SMALL, check_size, config_to_json
 
+    steps = _STEPS[args.codec] if args.steps is None else args.steps
     batch_size = _BATCH_SIZE[args.codec] if args.batch_size is None else args.batch_size
-    numbers = (args.layouts, args.held_out_layouts, args.steps, batch_size, args.threads)
+    numbers = (args.layouts, args.held_out_layouts, steps, batch_size, args.threads)
     if min(numbers) < 1 or max(numbers[:2]) > MOST_LAYOUTS or not args.learning_rate > 0:
         raise TrainingError(
             f"expected 1 to {MOST_LAYOUTS} --layouts and --held-out-layouts, at least one of --steps, "
             f"--batch-size and --threads, and a --learning-rate above 0, got {args.layouts}, "
-            f"{args.held_out_layouts}, {args.steps}, {batch_size}, {args.threads}, {args.learning_rate}"
+            f"{args.held_out_layouts}, {steps}, {batch_size}, {args.threads}, {args.learning_rate}"
         )
     config: CodecConfig = CODECS[args.codec]() if args.published else SMALL[args.codec]
     check_size(config, args.size, args.size)
@@ -95,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         image_size=args.size,
         layouts=args.layouts,
         seed=args.seed,
-        steps=args.steps,
+        steps=steps,
         batch_size=batch_size,
         learning_rate=args.learning_rate,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from dataclasses import dataclass
@@ -90,7 +91,16 @@ def load_codec(source: str | Path) -> TrainedCodec:
     Raises:
         CheckpointError: missing, damaged, or written by another version.
     """
-    folder = _SHIPPED / str(source) if str(source) in CODECS else Path(source)
+    return _shipped(str(source)) if str(source) in CODECS else _read(Path(source), str(source))
+
+
+@functools.cache
+def _shipped(name: str) -> TrainedCodec:
+    """Read once in a process: every episode of an evaluation asks for it."""
+    return _read(_SHIPPED / name, name)
+
+
+def _read(folder: Path, source: str) -> TrainedCodec:
     path = folder / NOTES
     if not path.is_file():
         raise CheckpointError(
