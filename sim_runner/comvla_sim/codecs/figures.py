@@ -167,7 +167,7 @@ def _show(axes: Axes, picture: npt.NDArray[np.uint8], title: str) -> None:
 def _saved(figure: Figure, form: str) -> bytes:
     buffer = io.BytesIO()
     metadata = {"Date": None} if form == "svg" else None
-    figure.savefig(buffer, format=form, metadata=metadata, dpi=150)
+    figure.savefig(buffer, format=form, metadata=metadata, dpi=100)
     return buffer.getvalue()
 
 

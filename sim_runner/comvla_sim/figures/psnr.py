@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     for form in ("svg", "png"):
         (args.out / f"psnr.{form}").write_bytes(psnr_figure(measured, ladder, form))
-    (args.out / "pictures.png").write_bytes(pictures_figure(trained, pictures[:2]))
+    (args.out / "pictures.png").write_bytes(pictures_figure(trained, pictures[:1]))
     summary = {
         "size": size,
         "codecs": [
