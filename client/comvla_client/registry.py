@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,9 +16,8 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from comvla.errors import ComVLAError
-from comvla.images.stills import STILL_CODINGS
-from comvla_client.image_encoders import ImageEncoder, StillEncoder, VideoEncoder
-from comvla_client.image_uplink import ImageUplink
+from comvla_client.image_forms import IMAGE_FORMS as IMAGE_FORMS  # a part of this table
+from comvla_client.image_forms import make_image_form, split_name
 from comvla_client.pruners import VLAADP, LightVLA, MotionGate
 from comvla_client.selection import (
     FullTransmission,
@@ -129,52 +127,6 @@ SELECTORS: dict[str, Entry[Selector]] = {
 """Selectors of tokens, by name."""
 
 
-@dataclass(frozen=True)
-class ImageEntry:
-    """A picture coding of the table; its name may carry a number, as in ``jpeg-75``.
-
-    Attributes:
-        make: an encoder for that number, or for None where there is none.
-        number: what the number is; empty where the coding takes none.
-        summary, source: as in :class:`Entry`.
-    """
-
-    make: Callable[[int | None], ImageEncoder]
-    number: str
-    summary: str
-    source: str
-
-
-def _still(coding: str) -> Callable[[int | None], ImageEncoder]:
-    return lambda quality: StillEncoder(coding, quality)
-
-
-def _video(crf: int | None) -> ImageEncoder:
-    return VideoEncoder() if crf is None else VideoEncoder(crf)
-
-
-IMAGE_FORMS: dict[str, ImageEntry] = {
-    **{
-        coding: ImageEntry(
-            _still(coding),
-            "quality 1 to 100",
-            f"{coding.upper()} pictures, vision in the cloud; without a number the link decides the quality",
-            "Pillow",
-        )
-        for coding in STILL_CODINGS
-    },
-    "h264": ImageEntry(
-        _video,
-        "rate factor 0 to 51",
-        "H.264 over time, vision in the cloud; 23 without a number",
-        "x264, by PyAV",
-    ),
-}
-"""Picture codings of an uplink, by name."""
-
-_IMAGE_NAME = re.compile(r"(?P<coding>[a-z][a-z0-9_]*)(?:-(?P<number>\d+))?")
-
-
 def register(name: str, entry: Entry[Selector]) -> None:
     """Gives a selector a name in this process.
 
@@ -214,14 +166,10 @@ def find_entry(name: str) -> Entry[Selector] | Entry[UplinkForm]:
     known = selectors()
     if name in known:
         return known[name]
-    parts = _IMAGE_NAME.fullmatch(name)
-    if parts is not None and parts["coding"] in IMAGE_FORMS:
-        form = IMAGE_FORMS[parts["coding"]]
-        number = None if parts["number"] is None else int(parts["number"])
-        if number is None or form.number:
-            return Entry(
-                lambda: ImageUplink(form.make(number), name), form.summary, "", form.source
-            )
+    parts = split_name(name)
+    if parts is not None:
+        form, number = parts
+        return Entry(lambda: make_image_form(form, number, name), form.summary, "", form.source)
     if ":" in name:
         made = _imported(name)
         return Entry(made, (inspect.getdoc(made) or name).splitlines()[0], "", name)

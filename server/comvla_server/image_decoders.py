@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from comvla.errors import CodecError, DependencyError, KeyFrameNeededError
 from comvla.images import stills, video
 from comvla.v1.policy_pb2 import InferRequest
 from comvla_server.identity import caller
+
+if TYPE_CHECKING:
+    from comvla_vla.codecs import TrainedCodec
 
 Picture: TypeAlias = NDArray[np.uint8]
 
@@ -118,6 +121,31 @@ class VideoDecoder:
         return pictures
 
 
+class SymbolDecoder:
+    """Every view the symbols of a learned codec as a receiver handed them on.
+
+    Args:
+        codec: ``"deepjscc"``, ``"witt"``, a folder of ``comvla-sim train codec``, or a trained codec.
+
+    Raises:
+        CheckpointError: there is no such codec.
+    """
+
+    def __init__(self, codec: str | TrainedCodec) -> None:
+        from comvla_vla.codecs import load_codec
+
+        self._trained = load_codec(codec) if isinstance(codec, str) else codec
+
+    def decode(self, request: InferRequest) -> list[Picture]:
+        """Equalises and decodes the symbols of all views; they stand alone."""
+        from comvla_vla.codecs.waveform import decode_waveform
+
+        return [
+            decode_waveform(view.data, view.height, view.width, self._trained)
+            for view in request.images.views
+        ]
+
+
 def _continued(
     held: _Streams | None, follows_step: int, sizes: list[tuple[int, int]]
 ) -> list[video.VideoReader]:
@@ -135,6 +163,8 @@ def _continued(
 DECODERS: dict[str, Callable[[], ImageDecoder]] = {
     **{coding: partial(StillDecoder, coding) for coding in stills.STILL_CODINGS},
     "h264": VideoDecoder,
+    "deep_jscc": partial(SymbolDecoder, "deepjscc"),
+    "witt": partial(SymbolDecoder, "witt"),
 }
 """What makes a decoder, by coding."""
 

@@ -18,6 +18,7 @@ COMMANDS = {
     "eval": "comvla_sim.experiments.command",
     "train": "comvla_sim.training.command",
     "report": "comvla_sim.report.command",
+    "figure": "comvla_sim.figures.command",
     "bench": "comvla_sim.bench.command",
     "libero": "comvla_sim.worlds.libero.command",
 }

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Okabe and Ito: told apart with every kind of colour vision, in print too.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-_MARKERS = "osD^vP"
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+MARKERS = "osD^vP"
 
 
 def success_against_tokens(lines: Sequence[dict[str, Any]], *, title: str = "") -> bytes:
@@ -77,7 +77,7 @@ def _draw(
         rates = [100 * point["success_rate"] for point in points]
         below = [rate - 100 * point["low"] for rate, point in zip(rates, points, strict=True)]
         above = [100 * point["high"] - rate for rate, point in zip(rates, points, strict=True)]
-        colour = _COLOURS[number % len(_COLOURS)]
+        colour = COLOURS[number % len(COLOURS)]
         axes.errorbar(
             [x_of(point) for point in points],
             rates,
@@ -85,7 +85,7 @@ def _draw(
             yerr=([max(0.0, b) for b in below], [max(0.0, a) for a in above]),
             label=method if condition == "normal" else f"{condition}: {method}",
             color=colour,
-            marker=_MARKERS[number % len(_MARKERS)],
+            marker=MARKERS[number % len(MARKERS)],
             linestyle="-" if condition == "normal" else "--",
             capsize=3,
         )

@@ -6,10 +6,10 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from comvla_sim.codecs import command as codec_command
 
 if TYPE_CHECKING:
     from comvla_sim.training.trainer import Progress, Recipe, Trainer
@@ -63,6 +63,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--float32", action="store_true", help="no bfloat16 arithmetic")
     parser.add_argument("--json", action="store_true", help="print a summary as JSON at the end")
     parser.set_defaults(run=run)
+    others = parser.add_subparsers(
+        title="other trainings", metavar="WHAT", help="the policy where nothing is named"
+    )
+    codec_command.add_parser(others)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -115,6 +119,7 @@ def _demonstrate(data: Path, layouts: int, validation_layouts: int, workers: int
 def _train(out: Path, data: Path, layouts: int, recipe: Recipe, threads: int) -> dict[str, Any]:
     import torch
 
+    from comvla_sim.training.bar import training_bar
     from comvla_sim.training.batches import Sampler
     from comvla_sim.training.demonstrations import Demonstrations
     from comvla_sim.training.trainer import Trainer, TrainingError
@@ -139,8 +144,8 @@ def _train(out: Path, data: Path, layouts: int, recipe: Recipe, threads: int) ->
     sampler = Sampler(train, Tabletop.tasks, prompt, bounds, recipe.seed)
     trainer = Trainer(config, recipe, out)
     trainer.resume()
-    with _training_bar(trainer) as show:
-        trainer.run(sampler, show)
+    with training_bar(recipe.steps, trainer.step) as show:
+        trainer.run(sampler, lambda progress: show(progress.step, _words(progress)))
     checks = Sampler(held_out, Tabletop.tasks, prompt, bounds, 0, paraphrase_share=0.0)
     validation = validate(trainer, checks)
     edge, cloud = trainer.learner.edge, trainer.learner.cloud
@@ -194,41 +199,6 @@ def validate(trainer: Trainer, sampler: Any, frames: int = 192) -> dict[str, flo
         )
         for k, how in cases
     }
-
-
-@contextmanager
-def _training_bar(trainer: Trainer) -> Iterator[Callable[[Progress], None]]:
-    """A bar on a terminal, plain lines elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-
-        def line(progress: Progress) -> None:
-            if progress.step % 100 == 0 or progress.step == progress.steps:
-                print(
-                    f"step {progress.step}/{progress.steps} {_words(progress)}",
-                    file=sys.stderr,
-                    flush=True,
-                )
-
-        yield line
-        return
-    columns = (
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
-    with Bar(TextColumn("training"), *columns, console=console) as bar:
-        task = bar.add_task("", total=trainer.recipe.steps, completed=trainer.step, note="")
-
-        def show(progress: Progress) -> None:
-            bar.update(task, completed=progress.step, note=_words(progress))
-
-        yield show
 
 
 def _words(progress: Progress) -> str:

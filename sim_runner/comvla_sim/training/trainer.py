@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import json
-import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from comvla.errors import ComVLAError
 from comvla_sim.training.batches import Sampler
 from comvla_sim.training.objective import Learner, Weights
+from comvla_sim.training.run_state import (
+    RunState,
+    TrainingError,
+    learning_rate,
+    load_run,
+    optimizer_tensors,
+    save_run,
+    set_optimizer_tensors,
+)
 from comvla_vla.config import ModelConfig
 from comvla_vla.nets import join
 
-
-class TrainingError(ComVLAError):
-    """A run that cannot start or go on; the message says what to change."""
+__all__ = ["Progress", "Recipe", "Trainer", "TrainingError", "learning_rate"]
 
 
 @dataclass(frozen=True)
@@ -92,31 +95,16 @@ class Trainer:
         Raises:
             TrainingError: the folder belongs to a run with another recipe.
         """
-        notes = self.folder / "state.json"
-        if not notes.is_file():
+        state = load_run(self.folder, self.recipe)
+        if state is None:
             return False
-        state = json.loads(notes.read_text())
-        ours = json.loads(json.dumps(asdict(self.recipe)))
-        if state["recipe"] != ours:
-            changed = sorted(k for k in ours if state["recipe"].get(k) != ours[k])
-            raise TrainingError(
-                f"{self.folder} holds a run with another {', '.join(changed)}: choose another folder"
-            )
-        self.step, self.seconds = int(state["step"]), float(state["seconds"])
-        self._set_state(load_file(self.folder / f"state-{self.step}.safetensors"))
+        self.step, self.seconds = state.step, state.seconds
+        self._set_state(state.tensors)
         return True
 
     def save(self) -> None:
         """Writes a checkpoint; the notes name it only once it is whole."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        save_file(self._state(), self.folder / f"state-{self.step}.safetensors")
-        notes = {"step": self.step, "seconds": self.seconds, "recipe": asdict(self.recipe)}
-        partial = self.folder / "state.json.writing"
-        partial.write_text(json.dumps(notes))
-        partial.replace(self.folder / "state.json")
-        for old in self.folder.glob("state-*.safetensors"):
-            if old.name != f"state-{self.step}.safetensors":
-                old.unlink()
+        save_run(self.folder, self.recipe, RunState(self.step, self.seconds, self._state()))
 
     def run(
         self,
@@ -178,9 +166,7 @@ class Trainer:
 
     def _state(self) -> dict[str, Tensor]:
         tensors = {f"learner.{name}": value for name, value in self._own_state().items()}
-        for i, moments in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{i}.{name}": value for name, value in moments.items()}
-        return tensors
+        return tensors | optimizer_tensors(self.optimizer)
 
     def _own_state(self) -> dict[str, Tensor]:
         # The projector stands in both halves but is one module: save it once.
@@ -194,17 +180,4 @@ class Trainer:
         with torch.no_grad():
             for name, value in self._own_state().items():
                 value.copy_(tensors[f"learner.{name}"])
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, value in tensors.items():
-            if name.startswith("optimizer."):
-                _, index, kind = name.split(".")
-                moments.setdefault(int(index), {})[kind] = value
-        whole = self.optimizer.state_dict()
-        self.optimizer.load_state_dict({**whole, "state": moments})
-
-
-def learning_rate(recipe: Recipe, step: int) -> float:
-    """Linear warm-up, then a cosine down to ``final_share``."""
-    done = step / recipe.steps
-    cosine = recipe.final_share + (1 - recipe.final_share) * 0.5 * (1 + math.cos(math.pi * done))
-    return recipe.learning_rate * min(1.0, (step + 1) / recipe.warmup_steps) * cosine
+        set_optimizer_tensors(self.optimizer, tensors)

@@ -1,0 +1,1 @@
+"""Figures by name: ``comvla-sim figure NAME``."""
