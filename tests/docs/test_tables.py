@@ -98,4 +98,4 @@ def test_the_guide_of_selectors_says_what_their_table_says() -> None:
         name: entry.source for name, entry in SELECTORS.items()
     }
     named = " ".join(row[0] for row in markdown.table(SELECTOR_GUIDE, "name | | |"))
-    assert set(re.findall(r"`(\w+)-", named)) == set(IMAGE_FORMS)
+    assert set(re.findall(r"`(\w+)(?:-\w)?`", named)) == set(IMAGE_FORMS)

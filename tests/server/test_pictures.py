@@ -26,12 +26,13 @@ from comvla_server.background import BackgroundServer
 from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.identity import Identity, caller, set_caller
-from comvla_server.image_decoders import VideoDecoder, available_decoders
+from comvla_server.image_decoders import DECODERS, VideoDecoder
 from comvla_server.inference_thread import InferenceThread
 from comvla_server.settings import ServerSettings
 from comvla_server.vision import VisionHalf
 from comvla_vla import CloudModel, EdgeModel, ImageRequest, PolicyRequest, random_policy
 
+CLASSICAL = ("jpeg", "webp", "avif", "h264")
 SIDE = STUB_INFO.image_size[0]
 
 
@@ -41,7 +42,9 @@ class StubVision:
     def __init__(self, decoders: Any = None, any_image_size: bool = False) -> None:
         self.info = STUB_INFO
         self.any_image_size = any_image_size
-        self.decoders = available_decoders() if decoders is None else decoders
+        self.decoders = (
+            {name: DECODERS[name]() for name in CLASSICAL} if decoders is None else decoders
+        )
 
     def encode(self, images: Any, instruction: Any) -> np.ndarray:
         cells = np.asarray(images[0], np.float32).reshape(4, SIDE // 4, 4, SIDE // 4, 3)

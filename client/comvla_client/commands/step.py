@@ -210,15 +210,19 @@ def _text(chunk: ActionChunk, info: ModelInfo) -> str:
     answered = (
         "from the cloud" if report.source == "cloud" else f"no answer: {report.fallback_reason}"
     )
+    # Pictures have bytes where tokens have K.
+    pictures = report.source == "cloud" and report.tokens == 0
+    budget = f", K* {report.paper_budget}, framed {report.framed_budget}"
     lines = [
         f"model     {info.name} (N {info.num_tokens}, D {info.token_dim})",
         f"source    {report.source} ({answered}{'; ' + report.detail if report.detail else ''})",
-        f"link      {report.snr_db} dB, {report.capacity_bits or 0:.0f} bits a period, "
-        f"K* {report.paper_budget}, framed {report.framed_budget}",
-        f"policy    {report.policy}: up to {report.token_budget} tokens in "
-        f"{1e3 * report.window_s:.0f} ms, {report.tokens_used} arrived",
-        f"sent      {report.uplink}: {report.tokens} tokens, {report.payload_bytes} B by the paper's accounting, "
-        f"{report.encoded_bytes} B coded, {report.framed_bytes} B framed",
+        f"link      {report.snr_db} dB, {report.capacity_bits or 0:.0f} bits a period"
+        f"{'' if report.paper_budget is None else budget}",
+        f"policy    {report.policy}: up to {report.token_budget} {'bytes' if pictures else 'tokens'} in "
+        f"{1e3 * report.window_s:.0f} ms, {report.tokens_used} tokens {'made of them' if pictures else 'arrived'}",
+        f"sent      {report.uplink}: {'pictures' if pictures else f'{report.tokens} tokens'}, "
+        f"{report.payload_bytes} B by the paper's accounting, {report.encoded_bytes} B coded, "
+        f"{report.framed_bytes} B framed",
         f"robot ms  {' '.join(f'{k} {v}' for k, v in milliseconds.items())}",
         f"server ms {' '.join(f'{k} {v}' for k, v in server.items()) or '-'}",
         f"flops     edge {report.edge_flops:.3g}, cloud {report.cloud_flops:.3g}",
