@@ -250,7 +250,7 @@ def test_the_command_leaves_a_codec_and_its_curve(tmp_path, capsys):
     # Again: nothing is left to train, and everything is the same.
     assert cli.main([*command, *folders]) == 0
     assert json.loads((out / "summary.json").read_text())["fingerprint"] == summary["fingerprint"]
-    figure = ["figure", "psnr", "--codec", str(out / "codec"), "--layouts", "1", "--pictures", "4"]
+    figure = ["psnr", "--codec", str(out / "codec"), "--layouts", "1", "--pictures", "4"]
     assert cli.main([*figure, "--data", str(tmp_path / "frames"), "--out", str(tmp_path)]) == 0
     drawn = json.loads((tmp_path / "psnr.json").read_text())
     assert drawn["codecs"][0]["fingerprint"] == summary["fingerprint"]

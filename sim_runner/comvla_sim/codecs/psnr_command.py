@@ -1,4 +1,4 @@
-"""``comvla-sim figure psnr``: learned codecs and JPEG over the SNR, and pictures to look at."""
+"""``comvla-sim psnr``: learned codecs and JPEG over the SNR, and pictures to look at."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ pictures.png with originals and reconstructions.
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Registers the figure."""
+    """Registers the subcommand."""
     parser = subparsers.add_parser(
         "psnr",
-        help="reconstruction against SNR: DeepJSCC, WITT, JPEG",
+        help="draw reconstruction against SNR: DeepJSCC, WITT, JPEG",
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,1 +1,0 @@
-"""Figures by name: ``comvla-sim figure NAME``."""
