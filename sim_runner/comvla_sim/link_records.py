@@ -49,7 +49,10 @@ class LinkRecord:
 
     @property
     def overrun(self) -> bool:
-        """Whether more was offered than the period had left: the capacity was violated."""
+        """Whether more was offered than the period had left: the capacity was violated.
+
+        A payload in pieces is meant to be cut, so of one this says nothing.
+        """
         return 8 * self.offered_bytes > self.available_bits
 
     def to_dict(self) -> dict[str, Any]:
