@@ -106,7 +106,7 @@ class NamespaceLink:
     def shape(self, bytes_per_s: float) -> None:
         """Holds one rate for what leaves the robot, in bytes of IP packets per second."""
         with Shaper(
-            self._robot_end(),
+            self.robot_end,
             mtu_bytes=self.settings.mtu_bytes,
             period_s=self.settings.profile.period_s,
         ) as shaper:
@@ -125,7 +125,7 @@ class NamespaceLink:
         if self._driver is not None:
             raise LinkError("this link follows a channel already: make another link for another")
         settings = self.settings
-        arguments = (self._robot_end(), settings.mtu_bytes, settings.profile, channel)
+        arguments = (self.robot_end, settings.mtu_bytes, settings.profile, channel)
         self._driver, _ = self._stack.enter_context(connected(driver.serve, *arguments))
         start = time.monotonic() + lead_s
         self._driver.send_bytes(str(start).encode())
@@ -175,10 +175,14 @@ class NamespaceLink:
             "sysctls": dict(settings.sysctls),
         }
 
-    def _robot_end(self) -> Side:
+    @property
+    def robot_end(self) -> Side:
+        """The robot's end of the cable, where what leaves it can be captured."""
         return Side(self.robot, wires.DEVICE, wires.ROBOT_MAC)
 
-    def _cloud_end(self) -> Side:
+    @property
+    def cloud_end(self) -> Side:
+        """The cloud's end of the cable."""
         return Side(self.cloud, wires.DEVICE, wires.CLOUD_MAC)
 
     def _set_up(self) -> None:
@@ -186,7 +190,7 @@ class NamespaceLink:
         self._stack.enter_context(guarding(self.name))
         for role in namespaces.ROLES:
             namespaces.create(self.name.namespace(role))
-        robot, cloud = self._robot_end(), self._cloud_end()
+        robot, cloud = self.robot_end, self.cloud_end
         ports = Side(air, _ROBOT_PORT), Side(air, _CLOUD_PORT)
         wires.join(robot, ports[0], mtu_bytes=settings.mtu_bytes)
         wires.join(cloud, ports[1], mtu_bytes=settings.mtu_bytes)
