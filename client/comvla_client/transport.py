@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Protocol
 
 import grpc
@@ -15,11 +16,14 @@ from comvla_client import channel
 from comvla_client.access import Access, Metadata, TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.streaming import PayloadStream, paced
+from comvla_client.warm_up import WarmUp
 
 __all__ = ["GrpcTransport", "ProgressiveTransport", "Transport", "TransportError"]
 
 Start = Callable[[Any, float, Metadata], Any]
 """Begins a call: a stub, seconds, and what proves who calls."""
+
+_FILLER_TIMEOUT_S = 1.0
 
 
 class Transport(Protocol):
@@ -69,6 +73,7 @@ class GrpcTransport:
         tls: encrypts; None sends in the clear.
         token: says who calls.
         insecure: lets the token cross a network in the clear.
+        warm_up: send filler ahead of a query that follows a silence (:mod:`comvla_client.warm_up`).
 
     Raises:
         HandshakeError: the target is no such address.
@@ -82,8 +87,10 @@ class GrpcTransport:
         token: Token | None = None,
         *,
         insecure: bool = False,
+        warm_up: bool = False,
     ) -> None:
         self.target = target
+        self._warm_up = WarmUp(self._send_filler) if warm_up else None
         self._access = Access(target, tls, token, insecure=insecure)
         self._lock = threading.Lock()
         self._closed = threading.Event()
@@ -108,7 +115,8 @@ class GrpcTransport:
             TransportError: no usable answer within ``timeout_s`` seconds.
             ClientClosedError: the transport is closed, before or during the call.
         """
-        answer: InferResponse = self._call(_unary("Infer", request), timeout_s)
+        with self._warmed(request.ByteSize()):
+            answer: InferResponse = self._call(_unary("Infer", request), timeout_s)
         return answer
 
     def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
@@ -132,7 +140,8 @@ class GrpcTransport:
             return stub.InferProgressive.future(messages, timeout=remaining_s, metadata=metadata)
 
         try:
-            answer: InferResponse = self._call(start, timeout_s).response
+            with self._warmed(stream.head.ByteSize() + len(stream.payload)):
+                answer: InferResponse = self._call(start, timeout_s).response
         finally:
             stopped.set()  # the thread that feeds gRPC may be waiting for its next piece
         return answer
@@ -140,8 +149,15 @@ class GrpcTransport:
     def close(self) -> None:
         """Ends calls under way with ClientClosedError. Closing twice does no harm."""
         self._closed.set()
+        if self._warm_up is not None:
+            self._warm_up.close()
         with self._lock:
             self._channel.close()
+
+    @property
+    def filler_bytes(self) -> int:
+        """Bytes of filler sent so far, with their frames; 0 without ``warm_up``."""
+        return 0 if self._warm_up is None else self._warm_up.sent_bytes
 
     def _call(self, start: Start, timeout_s: float) -> Any:
         attempts = channel.Attempts(timeout_s)
@@ -188,6 +204,17 @@ class GrpcTransport:
             stale, self._channel = self._channel, self._new_channel()
             self._unanswered = 0
         stale.close()
+
+    def _warmed(self, request_bytes: int) -> AbstractContextManager[None]:
+        return nullcontext() if self._warm_up is None else self._warm_up.around(request_bytes)
+
+    def _send_filler(self, message: bytes) -> None:
+        with self._lock:
+            if self._closed.is_set():
+                return
+            send: grpc.UnaryUnaryMultiCallable[bytes, bytes]
+            send = self._channel.unary_unary("/comvla.v1.PolicyService/GetModel")
+        send(message, timeout=_FILLER_TIMEOUT_S, metadata=self._access.metadata())
 
     def _new_channel(self) -> grpc.Channel:
         return self._access.channel()
