@@ -174,7 +174,10 @@ def _answer(question: dict[str, Any], reader: PacketReader, tap: socket.socket) 
     if "start" in question:
         reader.count_periods(question["start"], question["period_s"])
         return {}
-    answer: dict[str, Any] = {"up": dataclasses.asdict(seen.up), "down": dataclasses.asdict(seen.down)}
+    answer: dict[str, Any] = {
+        "up": dataclasses.asdict(seen.up),
+        "down": dataclasses.asdict(seen.down),
+    }
     if question["what"] == "all":
         statistics = tap.getsockopt(_SOL_PACKET, _PACKET_STATISTICS, 8)
         seen.lost += struct.unpack("II", statistics)[1]

@@ -14,21 +14,24 @@ from multiprocessing.connection import Connection
 from comvla_sim.bench.processes import announce, serving, wait_for_end
 from comvla_sim.demo.server_process import ServerProcess
 from comvla_sim.netlink.namespaces import enter
+from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread
 from comvla_sim.netlink.wires import CLOUD_ADDRESS
 
 SYNTHETIC = "synthetic"
 """Instead of a model: the paper's sizes and a cloud half that answers at once."""
 
 _PR_SET_PDEATHSIG = 1
+_REALTIME = "--realtime"
 
 
 @contextmanager
-def cloud_server(namespace: str, model: str) -> Iterator[str]:
+def cloud_server(namespace: str, model: str, *, realtime: bool = False) -> Iterator[str]:
     """Serves a model in a namespace while the block lasts.
 
     Args:
         namespace: the cloud's.
         model: :data:`SYNTHETIC`, or what ``comvla-server serve --model`` takes.
+        realtime: whether the server runs before ordinary processes, on a machine that is shared.
 
     Yields:
         ``host:port`` of the gRPC service, as the robot reaches it.
@@ -37,16 +40,20 @@ def cloud_server(namespace: str, model: str) -> Iterator[str]:
         ServerProcessError: ``comvla-server`` did not start.
     """
     if model == SYNTHETIC:
-        with serving(_serve_synthetic, namespace) as target:
+        with serving(_serve_synthetic, namespace, realtime) as target:
             yield target
         return
     enter_first = [sys.executable, "-m", "comvla_sim.netlink.cloud", namespace]
+    if realtime:
+        enter_first.append(_REALTIME)
     with ServerProcess(model, host=CLOUD_ADDRESS, launcher=enter_first) as server:
         yield server.target
 
 
-def _serve_synthetic(lifeline: Connection, namespace: str) -> None:
+def _serve_synthetic(lifeline: Connection, namespace: str, realtime: bool) -> None:
     enter(namespace)
+    if realtime:
+        prefer_this_thread(EMULATED)
     from comvla_server.background import BackgroundServer
     from comvla_server.engine import Engine
     from comvla_server.settings import ServerSettings
@@ -60,11 +67,15 @@ def _serve_synthetic(lifeline: Connection, namespace: str) -> None:
 
 
 def main(argv: list[str]) -> None:
-    """Becomes another program inside a namespace: ``NAMESPACE PROGRAM ARGUMENT...``."""
+    """Becomes another program inside a namespace: ``NAMESPACE [--realtime] PROGRAM ARGUMENT...``."""
     enter(argv[0])
+    program = argv[1:]
+    if program[0] == _REALTIME:
+        prefer_this_thread(EMULATED)
+        del program[0]
     # Ends with the process that keeps the link, also where that was killed.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    os.execvp(argv[1], argv[1:])
+    os.execvp(program[0], program)
 
 
 if __name__ == "__main__":

@@ -38,12 +38,12 @@ def serve(
         link: bandwidth, period and efficiency of the radio.
         channel: SNR in dB of each period.
     """
-    prefer_this_thread()
     lead_s = _FIRST_LEAD_S
     late_s: list[float] = []
     with Shaper(side, mtu_bytes=mtu_bytes, period_s=link.period_s) as shaper:
         capacities_bytes = (link.capacity_bits(snr_db) / 8.0 for snr_db in channel)
         shaper.set_capacity(next(capacities_bytes))
+        prefer_this_thread()
         announce(lifeline, "driver")
         try:
             start = float(lifeline.recv_bytes())

@@ -24,7 +24,7 @@ from comvla_sim.bench.processes import announce, connected
 from comvla_sim.netlink.cloud import SYNTHETIC, cloud_server
 from comvla_sim.netlink.link import LinkSettings, NamespaceLink
 from comvla_sim.netlink.namespaces import enter
-from comvla_sim.netlink.realtime import wait_until
+from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread, wait_until
 from comvla_sim.netlink.synthetic import INSTRUCTION, SyntheticEdge, observation
 
 ALLOWED_PERIODS = 2.0
@@ -44,6 +44,7 @@ class FlapParameters:
         deadline_s: longest that the robot waits for an answer; one control period.
         at: see :meth:`NamespaceLink.set_up_down`.
         seed: of lengths and moments.
+        realtime: robot and server run before ordinary processes.
     """
 
     count: int = 50
@@ -55,6 +56,7 @@ class FlapParameters:
     deadline_s: float = 0.05
     at: Literal["robot", "cloud"] = "cloud"
     seed: int = 0
+    realtime: bool = False
 
     def __post_init__(self) -> None:
         if self.count < 1 or not 0.0 < self.shortest_s <= self.longest_s:
@@ -81,7 +83,7 @@ def run(
     gaps: list[tuple[float, float]] = []
     with (
         NamespaceLink(settings) as link,
-        cloud_server(link.cloud, SYNTHETIC) as target,
+        cloud_server(link.cloud, SYNTHETIC, realtime=parameters.realtime) as target,
         connected(_serve_robot, link.robot, target, parameters, profile) as (robot, _),
     ):
         link.shape(profile.capacity_bits(parameters.snr_db) / 8 / profile.period_s)
@@ -89,9 +91,10 @@ def run(
         for number in range(parameters.count):
             time.sleep(parameters.between_s * dice.uniform(0.5, 1.5))
             # Evenly over the logarithm: as many below half a second as above.
-            away_s = parameters.shortest_s * (
-                parameters.longest_s / parameters.shortest_s
-            ) ** dice.random()
+            away_s = (
+                parameters.shortest_s
+                * (parameters.longest_s / parameters.shortest_s) ** dice.random()
+            )
             down = time.monotonic()
             link.set_up_down(False, at=parameters.at)
             wait_until(down + away_s)
@@ -110,9 +113,7 @@ def run(
     }
 
 
-def _flap(
-    down: float, up: float, steps: list[dict[str, Any]], period_s: float
-) -> dict[str, Any]:
+def _flap(down: float, up: float, steps: list[dict[str, Any]], period_s: float) -> dict[str, Any]:
     answered = [step for step in steps if step["source"] == "cloud" and step["ended"] > up]
     recovery_s = answered[0]["ended"] - up if answered else None
     missed = [s for s in steps if down <= s["ended"] <= up and s["source"] != "cloud"]
@@ -165,6 +166,8 @@ def _serve_robot(
     lifeline: Connection, namespace: str, target: str, parameters: FlapParameters, link: LinkProfile
 ) -> None:
     enter(namespace)
+    if parameters.realtime:
+        prefer_this_thread(EMULATED)
     edge = SyntheticEdge()
     with ComVLAClient(
         target,

@@ -11,8 +11,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from comvla.errors import DependencyError, LinkError
+
+if TYPE_CHECKING:
+    from pyroute2 import IPRoute
 
 NAMESPACE_FOLDER = Path("/run/netns")
 """Where Linux keeps named namespaces, and `ip netns` looks for them."""
@@ -23,6 +27,7 @@ ROLES = ("robot", "air", "cloud")
 _NAME = re.compile(r"comvla-(\d+)-(\d+)-(robot|air|cloud)")
 _CLONE_NEWNET = 0x4000_0000
 _MNT_DETACH = 2
+_MS_BIND = 4096
 
 
 @dataclass(frozen=True)
@@ -92,17 +97,38 @@ def create(name: str) -> None:
     Raises:
         LinkError: the system does not let this process.
     """
-    from pyroute2 import IPRoute, netns
-
-    try:
-        netns.create(name)
-        with IPRoute(netns=name) as routes:
-            routes.link("set", index=1, state="up")
-    except OSError as error:
-        raise _refused(error) from error
-    with entered(name), contextlib.suppress(OSError):  # kernels without IPv6 have no such file
+    path = NAMESPACE_FOLDER / name
+    with _anonymous_namespace():
+        try:
+            NAMESPACE_FOLDER.mkdir(parents=True, exist_ok=True)
+            path.touch(mode=0o400, exist_ok=False)
+            here = b"/proc/thread-self/ns/net"
+            if _libc().mount(here, os.fsencode(path), b"none", _MS_BIND, None) != 0:
+                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        except OSError as error:
+            remove(name)
+            raise _refused(error) from error
         for family in ("all", "default"):
-            Path(f"/proc/sys/net/ipv6/conf/{family}/disable_ipv6").write_text("1", encoding="ascii")
+            with contextlib.suppress(OSError):  # kernels without IPv6 have no such file
+                Path(f"/proc/sys/net/ipv6/conf/{family}/disable_ipv6").write_text("1", "ascii")
+    with routes_in(name) as routes:
+        routes.link("set", index=1, state="up")
+
+
+@contextlib.contextmanager
+def routes_in(name: str) -> Iterator[IPRoute]:
+    """The devices, addresses and routes of a namespace, to be read and changed.
+
+    Raises:
+        LinkError: there is no such namespace.
+    """
+    from pyroute2 import IPRoute
+
+    # Opened from inside, where pyroute2 by itself would fork this process.
+    with entered(name):
+        routes = IPRoute()
+    with routes:
+        yield routes
 
 
 def remove(name: str) -> None:

@@ -59,7 +59,8 @@ class RunSettings:
         every: periods from one query to the next.
         csi_delay: age of the reported SNR, in periods.
         budget: how the client counts; None: ``paper`` for the policy ``paper``, else ``framed``.
-        reserve_s: see :class:`comvla_sim.netlink.robot.RobotSettings`.
+        reserve_s: kept of the period for what is not sending; None: nothing for the policy
+            ``paper``, whose formula has none, and what was measured for the others.
         mean_snr_db: of the channel, for the size of the queries that measure the reserve.
         bandwidth_hz: of the link; None is the scale's own.
         period_s: T.
@@ -68,6 +69,7 @@ class RunSettings:
         mtu_bytes: largest IP packet.
         congestion_control: of both ends.
         sysctls: of both ends.
+        realtime: robot and server run before ordinary processes, on a machine that is shared.
     """
 
     scale: str = "paper"
@@ -85,6 +87,7 @@ class RunSettings:
     mtu_bytes: int = 1500
     congestion_control: str | None = "cubic"
     sysctls: tuple[tuple[str, str | int], ...] = (("tcp_slow_start_after_idle", 0),)
+    realtime: bool = False
 
     def __post_init__(self) -> None:
         if self.scale not in SCALES:
@@ -137,7 +140,7 @@ def run(
     own = robot_settings(settings)
     with (
         NamespaceLink(link_settings) as link,
-        cloud_server(link.cloud, own.model) as target,
+        cloud_server(link.cloud, own.model, realtime=settings.realtime) as target,
         capturing(link.robot_end) as capture,
         connected(robot.serve, link.robot, target, own, channel, settings.queries) as (
             asking,
@@ -189,8 +192,9 @@ def robot_settings(settings: RunSettings) -> RobotSettings:
         budget=budget,
         every=settings.every,
         csi_delay=settings.csi_delay,
-        reserve_s=settings.reserve_s,
+        reserve_s=0.0 if settings.reserve_s is None and budget == "paper" else settings.reserve_s,
         typical_tokens=max(1, min(typical, scale.num_tokens)),
+        realtime=settings.realtime,
     )
 
 

@@ -11,11 +11,12 @@ from __future__ import annotations
 import contextlib
 import math
 import socket
+from contextlib import ExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING
 
 from comvla.errors import LinkError
-from comvla_sim.netlink.namespaces import entered
+from comvla_sim.netlink.namespaces import entered, routes_in
 from comvla_sim.netlink.wires import ETHERNET_HEADER_BYTES, Side
 
 if TYPE_CHECKING:
@@ -30,6 +31,10 @@ BURST_SHARE = 0.06
 What a busy processor sends late it can send at once from a bucket of so much, 3 ms at T = 50 ms,
 and does not lose. The price: so much of a period's capacity is there at its very beginning.
 """
+
+SPARE_BYTES = 100
+"""What a bucket holds beyond the largest packet: an acknowledgement must not keep that one waiting
+for a period, in fades in which the bucket is all that a period has."""
 
 # Linux keeps the bucket's size as a time of at most 4.29 s, so at a lower rate than this one the
 # bucket would hold less than a packet, and packets would be dropped instead of delayed.
@@ -55,19 +60,20 @@ class Shaper:
         self._side = side
         self._mtu_bytes = mtu_bytes
         self._period_s = period_s
-        self._least_burst_bytes = mtu_bytes + ETHERNET_HEADER_BYTES
+        self._least_burst_bytes = mtu_bytes + ETHERNET_HEADER_BYTES + SPARE_BYTES
+        self._stack = ExitStack()
         self._routes: IPRoute | None = None
         self._nudge: socket.socket | None = None
         self._index = 0
         self._rate: float | None = None
 
     def __enter__(self) -> Shaper:
-        from pyroute2 import IPRoute
-
-        self._routes = IPRoute(netns=self._side.namespace)
+        self._routes = self._stack.enter_context(routes_in(self._side.namespace))
         self._index = self._routes.link_lookup(ifname=self._side.device)[0]
         with entered(self._side.namespace):
-            self._nudge = socket.socket(socket.AF_PACKET, socket.SOCK_RAW)
+            self._nudge = self._stack.enter_context(
+                socket.socket(socket.AF_PACKET, socket.SOCK_RAW)
+            )
             self._nudge.bind((self._side.device, _NUDGE_ETHERTYPE))
         return self
 
@@ -77,13 +83,8 @@ class Shaper:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._routes is not None:
-            with contextlib.suppress(OSError):
-                self._routes.close()
-            self._routes = None
-        if self._nudge is not None:
-            self._nudge.close()
-            self._nudge = None
+        self._routes = self._nudge = None
+        self._stack.close()
 
     @property
     def least_bytes(self) -> float:

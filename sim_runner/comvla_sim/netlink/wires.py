@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from comvla.errors import LinkError
-from comvla_sim.netlink.namespaces import entered
+from comvla_sim.netlink.namespaces import entered, routes_in
 
 ROBOT_ADDRESS = "10.53.0.1"
 CLOUD_ADDRESS = "10.53.0.2"
@@ -53,10 +53,10 @@ def join(left: Side, right: Side, *, mtu_bytes: int) -> None:
     Raises:
         LinkError: the system refuses, e.g. an MTU out of range.
     """
-    from pyroute2 import IPRoute, NetlinkError
+    from pyroute2 import NetlinkError
 
     try:
-        with IPRoute(netns=left.namespace) as routes:
+        with routes_in(left.namespace) as routes:
             routes.link(
                 "add",
                 kind="veth",
@@ -65,7 +65,7 @@ def join(left: Side, right: Side, *, mtu_bytes: int) -> None:
                 peer={"ifname": right.device, "mtu": mtu_bytes, "net_ns_fd": right.namespace},
             )
         for side in (left, right):
-            with IPRoute(netns=side.namespace) as routes:
+            with routes_in(side.namespace) as routes:
                 index = routes.link_lookup(ifname=side.device)[0]
                 if side.mac is not None:
                     routes.link("set", index=index, address=side.mac)
@@ -78,9 +78,7 @@ def join(left: Side, right: Side, *, mtu_bytes: int) -> None:
 
 def address(side: Side, own: str, peer: str, peer_mac: str) -> None:
     """Gives an end its address, and tells it the other's, so that nothing is asked on the air."""
-    from pyroute2 import IPRoute
-
-    with IPRoute(netns=side.namespace) as routes:
+    with routes_in(side.namespace) as routes:
         index = routes.link_lookup(ifname=side.device)[0]
         routes.addr("add", index=index, address=own, prefixlen=_PREFIX_LENGTH)
         routes.neigh("replace", dst=peer, lladdr=peer_mac, ifindex=index, state="permanent")
@@ -109,7 +107,7 @@ def steer(
     Raises:
         LinkError: the kernel does not have this congestion control, or refuses a number.
     """
-    from pyroute2 import IPRoute, NetlinkError
+    from pyroute2 import NetlinkError
 
     metrics: dict[str, str | int] = {}
     if congestion_control is not None:
@@ -118,7 +116,7 @@ def steer(
         metrics["initcwnd"] = initcwnd
     if quickack:
         metrics["quickack"] = 1
-    with IPRoute(netns=side.namespace) as routes:
+    with routes_in(side.namespace) as routes:
         index = routes.link_lookup(ifname=side.device)[0]
         try:
             routes.route("replace", dst=f"{peer}/32", oif=index, metrics=metrics)
@@ -146,9 +144,9 @@ def bridge(namespace: str, ports: Sequence[Side]) -> None:
     Raises:
         LinkError: the kernel has no bridges.
     """
-    from pyroute2 import IPRoute, NetlinkError
+    from pyroute2 import NetlinkError
 
-    with IPRoute(netns=namespace) as routes:
+    with routes_in(namespace) as routes:
         try:
             routes.link("add", ifname=_BRIDGE, kind="bridge", br_forward_delay=0, br_stp_state=0)
         except NetlinkError as error:
@@ -166,9 +164,7 @@ def bridge(namespace: str, ports: Sequence[Side]) -> None:
 
 def set_carrier(side: Side, up: bool) -> None:
     """Switches an end on or off; the other end loses its carrier, as behind an unplugged cable."""
-    from pyroute2 import IPRoute
-
-    with IPRoute(netns=side.namespace) as routes:
+    with routes_in(side.namespace) as routes:
         index = routes.link_lookup(ifname=side.device)[0]
         routes.link("set", index=index, state="up" if up else "down")
 
