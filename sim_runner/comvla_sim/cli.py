@@ -20,6 +20,7 @@ COMMANDS = {
     "report": "comvla_sim.report.command",
     "psnr": "comvla_sim.codecs.psnr_command",
     "bench": "comvla_sim.bench.command",
+    "link": "comvla_sim.netlink.command",
     "libero": "comvla_sim.worlds.libero.command",
 }
 """Subcommand to module."""

@@ -81,7 +81,7 @@ def web_server() -> Iterator[str]:
         server.server_close()
 
 
-def assert_returns_in_time(client: ComVLAClient) -> None:
+def assert_returns_in_time(client: ComVLAClient, reasons: tuple[str, ...]) -> None:
     """At the 99th percentile within 10 ms of the deadline.
 
     A machine that is busy with something else wakes every waiter late. How late is measured with a
@@ -92,7 +92,8 @@ def assert_returns_in_time(client: ComVLAClient) -> None:
         began = time.perf_counter()
         report = client.step(OBS, WORDS).report
         overruns_s.append(time.perf_counter() - began - client.deadline_s)
-        assert (report.source, report.fallback_reason) == ("hold", "deadline")
+        assert report.source == "hold"
+        assert report.fallback_reason in reasons
         began = time.perf_counter()
         never.wait(0.005)
         lateness_s.append(time.perf_counter() - began - 0.005)
@@ -112,7 +113,7 @@ def test_a_server_that_accepts_the_call_and_never_answers() -> None:
     service = StubService()
     service.before = never_answer
     with serving(service) as (target, _), client_of(target, deadline_s=0.02) as client:
-        assert_returns_in_time(client)
+        assert_returns_in_time(client, ("deadline",))
         service.before = None
         chunks = [client.step(OBS, WORDS) for _ in range(10)]
         assert "cloud" in [chunk.source for chunk in chunks]
@@ -124,7 +125,8 @@ def test_a_socket_that_accepts_and_never_speaks() -> None:
         client = client_of(target, deadline_s=0.02)
     with silent_listener(int(target.rpartition(":")[2])), client:
         client.step(OBS, WORDS)  # may find the connection that the server just closed
-        assert_returns_in_time(client)
+        # After a second gRPC gives such a connection up, and says so.
+        assert_returns_in_time(client, ("deadline", "unavailable"))
 
 
 def test_a_server_that_returns_is_found_by_the_first_step_after_it() -> None:

@@ -40,6 +40,13 @@ CALL_HEADERS_BYTES = 56
 also spells out path, authority and user agent: about 260 bytes with the frames above.
 """
 
+PART_PACKET_EVERY_BYTES = 32_768
+"""A request of more than this has packets that are not full, at most one in so many bytes.
+
+They arise where a piece that gRPC hands to the socket ends, and where the socket's buffer is full
+for a moment. Each costs headers of TCP and IP, and at times those of an HTTP/2 frame.
+"""
+
 GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
     ("grpc.http2.bdp_probe", 0),
     ("grpc.http2.lookahead_bytes", 8 << 20),
@@ -98,6 +105,13 @@ def request_wire_bytes(
     The same as :func:`wire_bytes` of the request plus :data:`CALL_HEADERS_BYTES`; the arguments
     are those of :func:`infer_request_bytes`.
 
+    With ``tcp_ip`` it is everything that leaves the robot for this query, and never less than
+    that: also the packet that acknowledges the answer, and packets that are not full
+    (:data:`PART_PACKET_EVERY_BYTES`). Against a packet capture it is at most 1 % above
+    (``comvla-sim bench wire``). Not counted: packets that are sent again because they were lost,
+    the opening of a connection (about 600 bytes with gRPC's own), and a ping of 69 bytes on a
+    connection that was silent for 10 s.
+
     Raises:
         CodecError: arguments out of range, see :func:`encoded_bytes`.
     """
@@ -113,7 +127,11 @@ def request_wire_bytes(
         protocol_version=protocol_version,
     )
     framed = _framed(message) + CALL_HEADERS_BYTES
-    return _with_tcp_ip(framed, mtu_bytes) if tcp_ip else framed
+    if not tcp_ip:
+        return framed
+    part_packets = framed // PART_PACKET_EVERY_BYTES
+    overhead = part_packets * (_FRAME_HEADER_BYTES + _TCP_IP_HEADER_BYTES) + _TCP_IP_HEADER_BYTES
+    return _with_tcp_ip(framed, mtu_bytes) + overhead
 
 
 def infer_request_bytes(

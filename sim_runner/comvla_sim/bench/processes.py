@@ -26,13 +26,27 @@ def serving(target: Callable[..., None], *arguments: object) -> Iterator[str]:
     Raises:
         RuntimeError: it ended, or said nothing within two minutes.
     """
+    with connected(target, *arguments) as (_, announcement):
+        yield announcement
+
+
+@contextmanager
+def connected(target: Callable[..., None], *arguments: object) -> Iterator[tuple[Connection, str]]:
+    """As :func:`serving`, for a process that is also asked things while it runs.
+
+    Yields:
+        This end of the lifeline, and what the process announced.
+
+    Raises:
+        RuntimeError: it ended, or said nothing within two minutes.
+    """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=target, args=(theirs, *arguments), daemon=True)
     process.start()
     theirs.close()
     try:
-        yield _announcement(ours, target.__name__)
+        yield ours, _announcement(ours, target.__name__)
     finally:
         ours.close()  # the other end sees the end of the file and returns
         process.join(STOP_TIMEOUT_S)

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from types import TracebackType
 
 from comvla.errors import ComVLAError
@@ -32,6 +33,9 @@ class ServerProcess:
     Args:
         model: as for ``--model``.
         ready_within_s: longest wait for the line that says ready, seconds.
+        host: address to listen on.
+        launcher: a program that becomes the one whose command line follows it, e.g. in another
+            network namespace.
 
     Attributes:
         target: ``host:port`` of the gRPC service, once entered.
@@ -41,9 +45,16 @@ class ServerProcess:
         ServerProcessError: on entering, when the server ends or is not ready in time.
     """
 
-    def __init__(self, model: str, *, ready_within_s: float = READY_WITHIN_S) -> None:
-        self._command = [sys.executable, "-m", "comvla_server", "serve", "--model", model]
-        self._command += ["--host", "127.0.0.1", "--port", "0", "--admin-port", "0"]
+    def __init__(
+        self,
+        model: str,
+        *,
+        ready_within_s: float = READY_WITHIN_S,
+        host: str = "127.0.0.1",
+        launcher: Sequence[str] = (),
+    ) -> None:
+        self._command = [*launcher, sys.executable, "-m", "comvla_server", "serve"]
+        self._command += ["--model", model, "--host", host, "--port", "0", "--admin-port", "0"]
         self._command += ["--threads", "1"]
         self._ready_within_s = ready_within_s
         self._process: subprocess.Popen[str] | None = None
