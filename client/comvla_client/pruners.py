@@ -13,6 +13,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from comvla.errors import ObservationError
+from comvla.handshake import COMPACT_POSITIONS
 from comvla_client.arrays import Array, NumpyArray, to_numpy
 from comvla_client.selection import ScoringContext
 
@@ -62,6 +63,7 @@ class VLAADP:
 
     uses_language: ClassVar[bool] = True
     sends_all: ClassVar[bool] = True
+    wants_run_options: ClassVar[tuple[str, ...]] = (COMPACT_POSITIONS,)
 
     def __init__(
         self,

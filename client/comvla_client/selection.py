@@ -141,7 +141,9 @@ class Selector(Protocol):
         uses_language: whether the projector has to run; without it the edge saves that work.
         sends_all: whether everything ranked goes, whatever the link carries.
 
-    One with a memory has a method ``reset()`` too, which the client calls when an episode begins.
+    One with a memory has a method ``reset()`` too, which the client calls when an episode begins. One that was made
+    for servers that run the model in some way names that in ``wants_run_options``: where the handshake lacks it, the
+    client warns.
     """
 
     uses_language: ClassVar[bool]

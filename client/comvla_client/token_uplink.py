@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 
 import numpy as np
@@ -14,6 +15,8 @@ from comvla_client.observation import CheckedObservation
 from comvla_client.selection import ScoringContext, Selector
 from comvla_client.sizing import TokenSizer
 from comvla_client.uplink import Setup, Uplink
+
+_log = logging.getLogger(__name__)
 
 
 class TokenUplink:
@@ -58,7 +61,7 @@ class TokenUplink:
         )
 
     def check_server(self, response: GetModelResponse) -> None:
-        """Quantization and size of the largest request.
+        """Quantization and size of the largest request; warns where the server does not run as the selector wants.
 
         Raises:
             HandshakeError: the server does not read them.
@@ -77,6 +80,18 @@ class TokenUplink:
                 f"{self._quantization} tokens take {largest_bytes}: raise the server's cap, fix a "
                 "smaller budget, or use a coarser quantization"
             )
+
+        options = handshake.run_options(response)
+        for wanted in getattr(self.selector, "wants_run_options", ()):
+            if wanted not in options:
+                _log.warning(
+                    "%s was made for servers with %s, this one runs with %s: actions will differ from the "
+                    "published method's; start it with `comvla-server serve --%s`",
+                    self.name,
+                    wanted,
+                    ", ".join(options) or "no options",
+                    wanted.replace("_", "-"),
+                )
 
     def hear(self, instruction: str) -> None:
         """Embeds the words when the instruction changes.

@@ -16,8 +16,12 @@ from comvla.images import coding_name, coding_number
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1 import policy_pb2
 
+COMPACT_POSITIONS = "compact_positions"
+"""Run option of a server that numbers the tokens that arrive 0, 1, 2, …"""
+
 _ENUM_PREFIX = "QUANTIZATION_"
 _LONGEST_TEXT = 200
+_MOST_OPTIONS = 32
 _LARGEST_SIZE = 65_535  # of anything counted: tokens, dimensions, actions, pixels
 
 # In the order told: widths explain a difference better than fingerprints do.
@@ -44,6 +48,7 @@ def to_response(
     server_version: str,
     image_codings: Sequence[str] = (),
     progressive: bool = False,
+    run_options: Sequence[str] = (),
 ) -> policy_pb2.GetModelResponse:
     """The server's answer to ``GetModel``.
 
@@ -55,6 +60,7 @@ def to_response(
         image_codings: names of :data:`comvla.images.IMAGE_CODINGS` that it reads; none where the
             robot has to see for itself.
         progressive: whether it answers ``InferProgressive``.
+        run_options: how the model is run where that changes its answers, e.g. :data:`COMPACT_POSITIONS`.
 
     Raises:
         ValueError: a quantization or picture coding that the protocol does not know.
@@ -79,6 +85,7 @@ def to_response(
         image_size=info.image_size,
         image_codings=[coding_number(name) for name in image_codings],
         progressive=progressive,
+        run_options=run_options,
     )
 
 
@@ -162,6 +169,11 @@ def offered_image_codings(response: policy_pb2.GetModelResponse) -> tuple[str, .
     """Names of the picture codings that the server reads; those newer than this side are left out."""
     names = (coding_name(number) for number in response.image_codings)
     return tuple(name for name in names if name is not None)
+
+
+def run_options(response: policy_pb2.GetModelResponse) -> tuple[str, ...]:
+    """How the server runs its model where that changes answers; what is no plain text is left out."""
+    return tuple(option for option in response.run_options[:_MOST_OPTIONS] if _is_text(option))
 
 
 def mismatch(edge: ModelInfo, cloud: ModelInfo) -> str | None:

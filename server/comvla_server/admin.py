@@ -37,6 +37,7 @@ class ModelDescription(BaseModel):
     control_period_s: float
     quantizations: list[str]
     image_codings: list[str]
+    run_options: list[str]
     max_request_bytes: int
     max_batch: int
 
@@ -145,6 +146,7 @@ def _describe_model(runtime: Runtime, settings: ServerSettings) -> ModelDescript
         control_period_s=info.control_period_s,
         quantizations=list(codec.QUANTIZATIONS),
         image_codings=list(runtime.engine.image_codings),
+        run_options=list(runtime.engine.run_options),
         max_request_bytes=settings.max_request_bytes,
         max_batch=settings.max_batch,
     )

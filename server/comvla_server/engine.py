@@ -68,6 +68,11 @@ class Engine:
         """Picture codings that are read."""
         return () if self.vision is None else tuple(self.vision.decoders)
 
+    @property
+    def run_options(self) -> tuple[str, ...]:
+        """How the model is run where that changes answers; empty for models that do not say."""
+        return tuple(getattr(self._cloud, "run_options", ()))
+
     def predict(self, requests: Sequence[AnyRequest]) -> list[NDArray[np.float32]]:
         """Actions for a batch of requests, whose numbers of tokens may differ; pictures are looked at first.
 

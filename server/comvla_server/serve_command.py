@@ -86,6 +86,7 @@ def load_engine(settings: ServerSettings) -> Engine:
         dtype=getattr(torch, settings.dtype),
         statistics_key=settings.statistics_key,
         options=options,
+        verify=settings.verify,
     )
     wanted = settings.vision == "on" or (settings.vision == "auto" and holds_whole(settings.model))
     if not wanted:

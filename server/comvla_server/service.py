@@ -111,6 +111,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             server_version=server_version(),
             progressive=True,
             image_codings=runtime.engine.image_codings,
+            run_options=runtime.engine.run_options,
         )
 
     async def Infer(

@@ -34,7 +34,7 @@ class ServerSettings:
 
     model: str = setting(
         "mini",
-        "checkpoint folder, hub repository, or mini, the shipped policy",
+        "checkpoint folder, hf://owner/name on the hub, or mini, the shipped policy",
         MODEL,
         metavar="SOURCE",
     )
@@ -72,6 +72,11 @@ class ServerSettings:
         False, "number the tokens that arrive 0, 1, 2, …, as VLA-ADP does", MODEL
     )
     compile: bool = setting(False, "run the backbone through torch.compile", MODEL)
+    verify: bool = setting(
+        True,
+        "compare weights with the digests beside them: 0.7 s of a core per GB, beside the reading",
+        MODEL,
+    )
 
     host: str = setting("127.0.0.1", "address to listen on; 0.0.0.0 for all", NETWORK)
     port: int = setting(

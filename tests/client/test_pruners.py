@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from client_stubs import StubEdge, model_response
 from hypothesis import given
 from hypothesis import strategies as st
 
 from comvla.errors import ObservationError
+from comvla_client.core import ClientCore
 from comvla_client.pruners import VLAADP, LightVLA, MotionGate, view_quotas
 from comvla_client.registry import make_selector
 from comvla_client.selection import ScoringContext
@@ -110,3 +112,19 @@ def test_ratios_that_make_no_sense_are_refused() -> None:
     pruner = VLAADP(view_shares=(1.0,))
     with pytest.raises(ValueError, match="one view share per view"):
         pruner.rank(context(text_driven_scores=lambda *_: np.zeros(8)))
+
+
+def test_vla_adp_warns_where_the_server_does_not_run_as_it_wants(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    response = model_response()
+    ClientCore(StubEdge(), selector="hard_voting").accept_server(response)
+    assert not caplog.messages
+    ClientCore(StubEdge(), selector="vla_adp").accept_server(response)
+    (warning,) = caplog.messages
+    assert "compact_positions, this one runs with no options" in warning
+    assert "comvla-server serve --compact-positions" in warning
+    caplog.clear()
+    response.run_options.extend(["dtype=bfloat16", "compact_positions"])
+    ClientCore(StubEdge(), selector="vla_adp").accept_server(response)
+    assert not caplog.messages

@@ -62,6 +62,23 @@ def test_a_description_survives_the_wire(info: ModelInfo) -> None:
     assert received.server_version == "0.1.0"
 
 
+def test_run_options_are_told_and_a_strangers_are_read_with_care() -> None:
+    told = ("dtype=bfloat16", handshake.COMPACT_POSITIONS, "fastv=3,0.75")
+    response = handshake.to_response(
+        OFT,
+        quantizations=codec.QUANTIZATIONS,
+        max_request_bytes=1 << 21,
+        server_version="0.1.0",
+        run_options=told,
+    )
+    assert handshake.run_options(response) == told
+    assert handshake.run_options(respond()) == ()
+    hostile = respond(run_options=["\x1b[2J", "", "x" * 10_000, "dtype=float16", *["a"] * 99])
+    assert handshake.run_options(hostile)[0] == "dtype=float16"
+    assert len(handshake.run_options(hostile)) <= 32
+    assert handshake.from_response(hostile) == OFT
+
+
 def test_halves_of_one_checkpoint_match_whatever_they_are_called() -> None:
     assert handshake.mismatch(OFT, OFT) is None
     assert handshake.mismatch(dataclasses.replace(OFT, name="my-copy"), OFT) is None

@@ -20,6 +20,7 @@ def http(server: BackgroundServer) -> Iterator[httpx.Client]:
 
 def test_model_is_described(http: httpx.Client) -> None:
     model = http.get("/v1/model").json()
+    assert model["run_options"] == []
     assert model["name"] == STUB_INFO.name
     assert model["fingerprint"] == STUB_INFO.fingerprint
     assert model["quantizations"] == ["float32", "float16", "int8", "int4"]

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import grpc
 import httpx
@@ -35,7 +36,7 @@ READY = re.compile(r"comvla-server ready grpc=(\S+) admin=(http://\S+) model=(\S
 @contextlib.contextmanager
 def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A Python process that does not outlive the block."""
-    path = os.pathsep.join((str(HERE), os.environ.get("PYTHONPATH", "")))
+    path = os.pathsep.join([str(HERE), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(
         [sys.executable, *arguments],
@@ -200,9 +201,18 @@ def test_a_signal_while_the_model_loads_ends_the_process(
     assert "Traceback" not in stderr
 
 
+def findings(target: str) -> list[dict[str, Any]]:
+    """What ``comvla doctor`` says of a server."""
+    command = [sys.executable, "-m", "comvla_client", "doctor", target, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    found: list[dict[str, Any]] = json.loads(done.stdout)["findings"]
+    return found
+
+
 def test_the_real_command_serves_a_checkpoint_until_ctrl_c(checkpoint: Path) -> None:
     _, cloud = random_policy(seed=0)
     arguments = ("-m", "comvla_server", "serve", "--model", str(checkpoint), *FREE_PORTS)
+    arguments += ("--compact-positions", "--fastv", "1,0.5", "--dtype", "bfloat16")
     with process(*arguments, "--threads", "1", "--log-format", "json") as running:
         target, admin, model = ready_line(running)
         assert target.startswith("127.0.0.1:")
@@ -210,7 +220,13 @@ def test_the_real_command_serves_a_checkpoint_until_ctrl_c(checkpoint: Path) -> 
         request = message(info=cloud.info, instruction="pull the green drawer open")
         with Robot(target) as robot:
             assert len(robot.infer(request).actions) == 8 * 4
-        assert httpx.get(f"{admin}/v1/model").json()["fingerprint"] == cloud.info.fingerprint
+        described = httpx.get(f"{admin}/v1/model").json()
+        assert described["fingerprint"] == cloud.info.fingerprint
+        how = ["dtype=bfloat16", "compact_positions", "fastv=1,0.5"]
+        assert described["run_options"] == how
+        (handshake,) = [f for f in findings(target) if f["check"] == "handshake"]
+        assert handshake["values"]["run_options"] == how
+        assert "run with dtype=bfloat16 compact_positions" in handshake["found"]
         running.send_signal(signal.SIGINT)
         code, stderr = end(running)
     assert code == 0

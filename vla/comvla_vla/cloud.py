@@ -52,6 +52,12 @@ class CloudModel:
         """The same weights run another way; both may be used."""
         return CloudModel(self.net, self.prompt, self.statistics, self.info, options)
 
+    @property
+    def run_options(self) -> tuple[str, ...]:
+        """How it is run where that changes answers: ``"dtype=bfloat16"``, ``"compact_positions"``, …"""
+        dtype = str(self.dtype).removeprefix("torch.")
+        return (*([] if dtype == "float32" else [f"dtype={dtype}"]), *self.options.describe())
+
     def check_instruction(self, instruction: str) -> None:
         """Raises InstructionError where :meth:`predict` would."""
         self.prompt.ids(instruction)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from comvla.handshake import COMPACT_POSITIONS
+
 
 @dataclass(frozen=True)
 class FastV:
@@ -49,3 +51,16 @@ class CloudOptions:
     fastv: FastV | None = None
     compile: bool = False
     noise_seed: int = 0
+
+    def describe(self) -> tuple[str, ...]:
+        """Those choices that change answers, as the handshake tells them; empty where all are as configured."""
+        words = []
+        if self.first_slot is not None:
+            words.append(f"first_slot={self.first_slot}")
+        if self.compact_positions:
+            words.append(COMPACT_POSITIONS)
+        if self.fastv is not None:
+            words.append(f"fastv={self.fastv.layer},{self.fastv.drop_ratio:g}")
+        if self.noise_seed:
+            words.append(f"noise_seed={self.noise_seed}")
+        return tuple(words)

@@ -43,7 +43,14 @@ def shake_hands(
         f"{model.name} {model.fingerprint[:12]} on comvla-server {response.server_version}: "
         f"N {model.num_tokens}, D {model.token_dim}, chunks of {model.action_horizon}"
     )
-    values = {"model": dataclasses.asdict(model), "server_version": response.server_version}
+    options = handshake.run_options(response)
+    if options:
+        found += f", run with {' '.join(options)}"
+    values = {
+        "model": dataclasses.asdict(model),
+        "server_version": response.server_version,
+        "run_options": options,
+    }
     return Finding("handshake", "ok", found, values=values), response, model
 
 

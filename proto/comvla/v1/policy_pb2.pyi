@@ -63,7 +63,7 @@ class GetModelRequest(_message.Message):
     def __init__(self, protocol_version: _Optional[int] = ...) -> None: ...
 
 class GetModelResponse(_message.Message):
-    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size", "image_codings", "progressive")
+    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size", "image_codings", "progressive", "run_options")
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_NAME_FIELD_NUMBER: _ClassVar[int]
     MODEL_FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
@@ -83,6 +83,7 @@ class GetModelResponse(_message.Message):
     IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_CODINGS_FIELD_NUMBER: _ClassVar[int]
     PROGRESSIVE_FIELD_NUMBER: _ClassVar[int]
+    RUN_OPTIONS_FIELD_NUMBER: _ClassVar[int]
     protocol_version: int
     model_name: str
     model_fingerprint: str
@@ -102,7 +103,8 @@ class GetModelResponse(_message.Message):
     image_size: _containers.RepeatedScalarFieldContainer[int]
     image_codings: _containers.RepeatedScalarFieldContainer[ImageCoding]
     progressive: bool
-    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ..., image_codings: _Optional[_Iterable[_Union[ImageCoding, str]]] = ..., progressive: bool = ...) -> None: ...
+    run_options: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ..., image_codings: _Optional[_Iterable[_Union[ImageCoding, str]]] = ..., progressive: bool = ..., run_options: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class InferRequest(_message.Message):
     __slots__ = ("session_id", "step", "instruction", "proprio", "payload", "model_fingerprint", "snr_db", "snr_age_s", "protocol_version", "images")

@@ -43,6 +43,7 @@ class InProcessTransport:
             server_version=server_version(),
             progressive=True,
             image_codings=self._engine.image_codings,
+            run_options=self._engine.run_options,
         )
 
     def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
