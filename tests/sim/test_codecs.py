@@ -232,6 +232,7 @@ def test_curves_and_figures_of_a_codec(pictures, shown, tmp_path):
 # ---------------------------------------------------------------- the command
 
 
+@pytest.mark.slow
 @pytest.mark.simulator
 def test_the_command_leaves_a_codec_and_its_curve(tmp_path, capsys):
     out = tmp_path / "run"

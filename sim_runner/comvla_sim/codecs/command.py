@@ -43,7 +43,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--codec", required=True, choices=("deepjscc", "witt"))
+    parser.add_argument(
+        "--codec", default="deepjscc", choices=("deepjscc", "witt"), help="(deepjscc)"
+    )
     parser.add_argument("--out", type=Path, help="folder of the run (runs/codecs/CODEC)")
     parser.add_argument("--data", type=Path, help="frames (runs/codecs/frames-SIZE)")
     parser.add_argument("--size", type=int, default=128, help="side of a picture, pixels (128)")
