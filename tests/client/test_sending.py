@@ -18,7 +18,7 @@ from client_stubs import (
     fault,
     observation,
 )
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from comvla.errors import LinkError
@@ -111,6 +111,7 @@ def test_numbers_out_of_range_are_refused(make: Any) -> None:
 # ---- Paper ------------------------------------------------------------------------------------
 
 
+@settings(deadline=None)
 @given(snr_db=st.floats(-30, 40), age_s=st.floats(0, 10))
 def test_paper_takes_any_report_at_its_word(snr_db: float, age_s: float) -> None:
     plan = Paper().plan(situation(SnrReading(snr_db, age_s)))
@@ -169,6 +170,7 @@ def test_paper_without_an_snr_says_what_else_there_is() -> None:
 # ---- Margin -----------------------------------------------------------------------------------
 
 
+@settings(deadline=None)
 @given(snr_db=st.floats(-10, 30), age_s=st.floats(0.001, 1.0), outage=st.floats(0.01, 0.5))
 def test_margin_sizes_by_the_quantile_of_what_the_link_is_now(
     snr_db: float, age_s: float, outage: float

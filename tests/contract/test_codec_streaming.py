@@ -10,7 +10,7 @@ import grpc
 import numpy as np
 import pytest
 from http2_tap import DATA, HEADERS, WINDOW_UPDATE, Tap
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from comvla import codec
@@ -129,6 +129,7 @@ def test_messages_in_a_hurry_cost_no_more(server_port: int) -> None:
     assert promised - 9 * (len(sent) + 1) <= data <= promised
 
 
+@settings(deadline=None)
 @given(
     k=st.integers(1, 300),
     dim=st.integers(1, 3000),
@@ -149,6 +150,7 @@ def test_pieces_end_between_tokens_and_cover_the_payload(
     assert all((steps > 0) & (steps <= piece))
 
 
+@settings(deadline=None)
 @given(
     request_bytes=st.integers(0, 40_000),
     window_s=st.sampled_from([0.0, 0.05, 2.5]),
@@ -170,6 +172,7 @@ def test_message_sizes_are_exact(
     assert piece.ByteSize() == codec.progressive_piece_bytes(length)
 
 
+@settings(deadline=None)
 @given(link_bytes=st.floats(0, 1e7), dim=st.integers(1, 4096))
 def test_pieces_balance_their_overhead_against_what_a_cut_costs(
     link_bytes: float, dim: int

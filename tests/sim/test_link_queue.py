@@ -8,7 +8,7 @@ from collections import deque
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_enforced_link import DIM, LINK, Receiver, request_of, wire_bytes
 
@@ -53,6 +53,7 @@ def drive(link: EnforcedLink, calls: list[tuple[int, bool, int]], window_s: floa
             link.advance(pause)
 
 
+@settings(deadline=None)
 @given(
     calls=CALLS,
     mode=st.sampled_from(MODES),
@@ -104,6 +105,7 @@ def test_no_period_carries_more_than_it_can_and_all_bytes_are_accounted_for(
     assert [p.period for p in link.periods] == list(range(link.period + 1))
 
 
+@settings(deadline=None)
 @given(
     offers=st.lists(
         st.tuples(st.integers(0, 6000), st.integers(1, 4), st.integers(0, 2)), max_size=15
