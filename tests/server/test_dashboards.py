@@ -89,6 +89,7 @@ def test_every_panel_returns_data(
 
 
 def test_dashboards_are_what_their_description_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("grafana_foundation_sdk", reason="Grafana's SDK needs Python 3.11")
     monkeypatch.syspath_prepend(str(DOCKER / "grafana"))
     built = runpy.run_path(str(DOCKER / "grafana" / "build.py"))
     assert {board.stem for board in BOARDS} == set(built["DASHBOARDS"])
