@@ -57,7 +57,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
         type=float,
         default=15.0,
         metavar="S",
-        help="longest that the examination may take (default: %(default)s)",
+        help="longest that the examination may take, loading --edge aside (default: %(default)s)",
     )
     parser.add_argument(
         "--calls", type=int, default=100, metavar="N", help="small calls to time (default: 100)"
@@ -156,7 +156,9 @@ def _beyond(
     if response is None or model is None:
         return
     if arguments.edge is not None:
-        yield server.same_model(arguments.edge, load_edge(arguments.edge).info, model)
+        with allowance.paused():  # loading torch and weights may take longer than all the rest
+            edge = load_edge(arguments.edge).info
+        yield server.same_model(arguments.edge, edge, model)
     yield server.health(access, max(allowance.at_most_s(arguments.connect_timeout_s), 0.1))
     with silence.SilentConnection(access, max(allowance.at_most_s(1.0), 0.1)) as silent:
         timed, trips = round_trips.round_trips(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -56,6 +57,15 @@ class Allowance:
     def elapsed_s(self) -> float:
         """Seconds since the beginning."""
         return self._clock() - self._began_s
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """What runs inside is work of this machine alone, and takes nothing of the time."""
+        began_s = self._clock()
+        try:
+            yield
+        finally:
+            self._began_s += self._clock() - began_s
 
     def left_s(self) -> float:
         """Seconds left; 0 when none are."""
