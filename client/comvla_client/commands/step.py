@@ -171,10 +171,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _beats(times: int, every_s: float) -> Iterator[int]:
     """Counts, in a steady rhythm; a beat that was missed is not made up for."""
     due_s = time.monotonic()
-    for number in itertools.count() if times == 0 else range(times):
-        yield number
+    for beat in itertools.count() if times == 0 else range(times):
+        yield beat
         due_s = max(due_s + every_s, time.monotonic())
-        if number + 1 != times:
+        if beat + 1 != times:
             time.sleep(max(0.0, due_s - time.monotonic()))
 
 
