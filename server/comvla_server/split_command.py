@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from comvla.number_arguments import whole
+
 _DESCRIPTION = """\
 Write DST/edge for robots and DST/cloud for the server, each with only the weights that it needs.
 
@@ -47,14 +49,18 @@ def add_parser(subparsers: Any) -> None:
     published = parser.add_argument_group("what a published checkpoint does not say")
     published.add_argument("--name", default="openvla-oft", help="of the policy (%(default)s)")
     published.add_argument(
-        "--views", type=int, default=2, metavar="N", help="cameras (%(default)s)"
+        "--views", type=whole(1, 64), default=2, metavar="N", help="cameras (%(default)s)"
     )
     published.add_argument(
-        "--horizon", type=int, default=8, metavar="H", help="actions in a chunk (%(default)s)"
+        "--horizon",
+        type=whole(1, 4096),
+        default=8,
+        metavar="H",
+        help="actions in a chunk (%(default)s)",
     )
     published.add_argument(
         "--first-slot",
-        type=int,
+        type=whole(-1, 1),
         default=-1,
         choices=(-1, 0, 1),
         help="hidden states that the head reads, from the first action placeholder: -1 as OpenVLA-OFT and "

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from comvla.number_arguments import number, whole
 from comvla_server.identity import IDENTITY_PATTERN, Identity, Limits
 from comvla_server.tokens import TokenLine, TokensError, new_token, read_lines
 
@@ -41,8 +42,8 @@ def add_parser(subparsers: Any) -> None:
         ("--bytes-per-s", "bytes that it may send"),
         ("--max-request-bytes", "largest request that it may send"),
     ):
-        whole = name == "--max-request-bytes"
-        new.add_argument(name, type=int if whole else float, metavar="N", help=words)
+        counts = name == "--max-request-bytes"
+        new.add_argument(name, type=whole() if counts else number(), metavar="N", help=words)
     listing = actions.add_parser("list", help="print identities and the beginnings of hashes")
     revoke = actions.add_parser("revoke", help="take tokens away")
     revoke.add_argument("identity", help="name of the robot or operator")

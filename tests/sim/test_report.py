@@ -124,3 +124,18 @@ def test_the_terminal_shows_what_the_json_says() -> None:
     assert re.search(r"hard_voting +16 +4 +4\b", text)
     assert "wrong_instruction: successes" in text
     assert "McNemar" in text
+
+
+def test_an_episode_in_two_files_counts_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = rows()
+    first, both = write(tmp_path / "a.jsonl", made[:8]), write(tmp_path / "b.jsonl", made)
+    other_seed = write(tmp_path / "c.jsonl", rows(seed=1))
+    arguments = ["report", first, both, other_seed, "--json", "--out", str(tmp_path / "report")]
+    assert cli.main(arguments) == 0
+    captured = capsys.readouterr()
+    (summary,) = json.loads(captured.out)["groups"].values()
+    counted = {(r["method"], r["k"]): r["episodes"] for r in summary["aggregate"]}
+    assert counted["full", 512] == 20, "ten of each seed"
+    assert "b.jsonl: 8 of 31 episodes stand in a file before it" in captured.err

@@ -71,6 +71,17 @@ def test_a_finished_command_is_quick_and_says_the_same(run_folder, capsys):
 
 
 @pytest.mark.simulator
+def test_a_run_does_not_go_on_with_other_demonstrations(sampler, run_folder, tmp_path):
+    data = Demonstrations(run_folder / "demonstrations" / "train")
+    other = Demonstrations(run_folder / "demonstrations" / "validation")
+    assert data.digest() == Demonstrations(data.path).digest() != other.digest()
+    Trainer(mini(), TINY, tmp_path, data.digest()).save()
+    assert Trainer(mini(), TINY, tmp_path, data.digest()).resume()
+    with pytest.raises(TrainingError, match="a run on other data"):
+        Trainer(mini(), TINY, tmp_path, other.digest()).resume()
+
+
+@pytest.mark.simulator
 def test_an_interrupted_run_ends_where_an_uninterrupted_one_does(sampler, tmp_path):
     whole = Trainer(mini(), TINY, tmp_path / "whole")
     whole.run(sampler, lambda _: None)

@@ -32,7 +32,8 @@ class Linear(nn.Linear):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., in) to (..., out)."""
-        if x.device.type == "cpu" and x.dtype == torch.bfloat16 and not cpu_multiplies_bfloat16():
+        narrow = self.weight.dtype == x.dtype == torch.bfloat16
+        if narrow and x.device.type == "cpu" and not cpu_multiplies_bfloat16():
             return widened_linear(x, self.weight, self.bias)
         return F.linear(x, self.weight, self.bias)
 

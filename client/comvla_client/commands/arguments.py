@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 from comvla import codec
 from comvla.errors import DependencyError
+from comvla.number_arguments import SECONDS, SNR_DB
 from comvla_client.access import Access, TlsOptions
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.edge import EdgeModel
@@ -20,7 +21,7 @@ def add_target(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", metavar="HOST:PORT", help="gRPC address of the server")
     parser.add_argument(
         "--connect-timeout-s",
-        type=float,
+        type=SECONDS,
         default=5.0,
         metavar="S",
         help="seconds to wait for the server (default: %(default)s)",
@@ -81,7 +82,7 @@ def add_link(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("link", "K* = floor(eta W T log2(1 + SNR) / (D B))")
     group.add_argument(
         "--snr-db",
-        type=float,
+        type=SNR_DB,
         default=10.0,
         metavar="DB",
         help="reported SNR in dB, -inf for no link (default: %(default)s)",

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator
 
 from comvla.errors import LinkError
+from comvla.number_arguments import SECONDS, whole
 from comvla_client.access import Access
 from comvla_client.commands.arguments import (
     Subparsers,
@@ -54,20 +55,24 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     add_target(parser)
     parser.add_argument(
         "--seconds",
-        type=float,
+        type=SECONDS,
         default=15.0,
         metavar="S",
         help="longest that the examination may take, loading --edge aside (default: %(default)s)",
     )
     parser.add_argument(
-        "--calls", type=int, default=100, metavar="N", help="small calls to time (default: 100)"
+        "--calls",
+        type=whole(1, 1_000_000),
+        default=100,
+        metavar="N",
+        help="small calls to time (default: 100)",
     )
     parser.add_argument(
         "--edge", metavar="SOURCE", help="also compare this robot's half of a model"
     )
     parser.add_argument(
         "--tokens",
-        type=int,
+        type=whole(1, 65_535),
         metavar="K",
         help="tokens of the query whose time is estimated (default: K* of the link below)",
     )

@@ -8,6 +8,7 @@ import math
 import time
 from typing import Any
 
+from comvla.number_arguments import whole
 from comvla_client.commands.arguments import Subparsers, add_link, link_of
 from comvla_client.commands.snr_arguments import add_source, opened
 from comvla_client.errors import SnrSourceError
@@ -40,7 +41,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
         metavar="S",
         help="seconds between lines (default: %(default)s)",
     )
-    parser.add_argument("--count", type=int, metavar="N", help="stop after so many lines")
+    parser.add_argument("--count", type=whole(0), metavar="N", help="stop after so many lines")
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     add_link(parser)
     return parser

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from comvla.errors import DependencyError, ObservationError
 from comvla.model_info import ModelInfo
+from comvla.number_arguments import SECONDS, SEED, number, whole
 from comvla_client.client import ComVLAClient
 from comvla_client.commands.arguments import (
     Subparsers,
@@ -69,7 +70,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--proprio",
-        type=float,
+        type=number(),
         nargs="+",
         metavar="X",
         help="raw proprioception (default: zeros)",
@@ -86,7 +87,10 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
         help="send pictures instead, e.g. jpeg-75: the cloud sees, and the robot needs no model",
     )
     parser.add_argument(
-        "--tokens", type=int, metavar="K", help="send K tokens whatever the SNR (bytes of pictures)"
+        "--tokens",
+        type=whole(1),
+        metavar="K",
+        help="send K tokens whatever the SNR (bytes of pictures)",
     )
     parser.add_argument(
         "--sending",
@@ -95,19 +99,19 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
         help="how much is sent when, see docs/edge-sdk.md (default: %(default)s)",
     )
     parser.add_argument(
-        "--deadline-s", type=float, metavar="S", help="longest that a step may take"
+        "--deadline-s", type=SECONDS, metavar="S", help="longest that a step may take"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the synthetic observation")
+    parser.add_argument("--seed", type=SEED, default=0, help="of the synthetic observation")
     parser.add_argument(
         "--repeat",
-        type=int,
+        type=whole(0),
         default=1,
         metavar="N",
         help="send N times as one robot, 0 without end (default: %(default)s)",
     )
     parser.add_argument(
         "--every-s",
-        type=float,
+        type=number(0, 1e6),
         default=0.4,
         metavar="S",
         help="seconds from one to the next (default: %(default)s, chunks of eight at 20 Hz)",
@@ -167,10 +171,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _beats(times: int, every_s: float) -> Iterator[int]:
     """Counts, in a steady rhythm; a beat that was missed is not made up for."""
     due_s = time.monotonic()
-    for number in itertools.count() if times == 0 else range(times):
-        yield number
+    for beat in itertools.count() if times == 0 else range(times):
+        yield beat
         due_s = max(due_s + every_s, time.monotonic())
-        if number + 1 != times:
+        if beat + 1 != times:
             time.sleep(max(0.0, due_s - time.monotonic()))
 
 

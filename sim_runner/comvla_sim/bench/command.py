@@ -8,6 +8,8 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+from comvla.number_arguments import whole
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Registers ``bench`` and its benchmarks."""
@@ -21,10 +23,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         bench = benches.add_parser(name, help=text, description=text)
         bench.add_argument("--json", action="store_true", help="print one JSON object")
         bench.add_argument(
-            "--repetitions", type=_at_least(1), help="timed calls (default: the bench's own)"
+            "--repetitions", type=whole(1), help="timed calls (default: the bench's own)"
         )
         bench.add_argument(
-            "--warm-up", type=_at_least(0), help="calls before them (default: the bench's own)"
+            "--warm-up", type=whole(0), help="calls before them (default: the bench's own)"
         )
         add_options(bench)
     parser.set_defaults(run=run)
@@ -40,19 +42,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _transport_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--k", dest="token_budget", type=_at_least(1), help="tokens (32)")
+    parser.add_argument("--k", dest="token_budget", type=whole(1), help="tokens (32)")
 
 
 def _edge_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--k", dest="token_budget", type=_at_least(1), help="tokens (32)")
-    parser.add_argument("--threads", type=_at_least(1), help="of the numerical libraries (1)")
+    parser.add_argument("--k", dest="token_budget", type=whole(1), help="tokens (32)")
+    parser.add_argument("--threads", type=whole(1), help="of the numerical libraries (1)")
 
 
 def _batching_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--clients", type=_at_least(1), help="robots (16)")
-    parser.add_argument("--max-batch", type=_at_least(2), help="of the batching server (8)")
+    parser.add_argument("--clients", type=whole(1), help="robots (16)")
+    parser.add_argument("--max-batch", type=whole(2), help="of the batching server (8)")
     parser.add_argument("--model", help="mini, random or a checkpoint (mini)")
-    parser.add_argument("--threads", type=_at_least(0), help="of torch in the server (1)")
+    parser.add_argument("--threads", type=whole(0), help="of torch in the server (1)")
 
 
 def _model_options(parser: argparse.ArgumentParser) -> None:
@@ -67,11 +69,11 @@ def _model_options(parser: argparse.ArgumentParser) -> None:
         metavar="K,K,…",
         help="visual tokens of a request to the cloud half (512,128,64,32,16)",
     )
-    parser.add_argument("--prompt-tokens", type=_at_least(1), help="of the prompt (30)")
+    parser.add_argument("--prompt-tokens", type=whole(1), help="of the prompt (30)")
     parser.add_argument(
-        "--layers", type=_at_least(1), help="of the backbone, fewer for less memory (all)"
+        "--layers", type=whole(1), help="of the backbone, fewer for less memory (all)"
     )
-    parser.add_argument("--threads", type=_at_least(0), help="of torch (its own choice)")
+    parser.add_argument("--threads", type=whole(0), help="of torch (its own choice)")
     parser.add_argument(
         "--cpu-time",
         action="store_true",
@@ -122,20 +124,7 @@ def _given(parameters: Callable[..., Any], args: argparse.Namespace) -> Any:
 
 
 def _token_budgets(text: str) -> tuple[int, ...]:
-    return tuple(_at_least(1)(part) for part in text.split(","))
-
-
-def _at_least(least: int) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
-        if value < least:
-            raise argparse.ArgumentTypeError(f"expected a whole number >= {least}, got {text!r}")
-        return value
-
-    return parse
+    return tuple(whole(1)(part) for part in text.split(","))
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from comvla.number_arguments import SEED, number, whole
+
 if TYPE_CHECKING:
     from comvla_sim.codecs.pictures import Pictures
     from comvla_sim.codecs.trainer import CodecRecipe, Progress
@@ -48,18 +50,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--out", type=Path, help="folder of the run (runs/codecs/CODEC)")
     parser.add_argument("--data", type=Path, help="frames (runs/codecs/frames-SIZE)")
-    parser.add_argument("--size", type=int, default=128, help="side of a picture, pixels (128)")
+    parser.add_argument("--size", type=whole(), default=128, help="side of a picture, pixels (128)")
     parser.add_argument("--published", action="store_true", help="the published network's size")
-    parser.add_argument("--layouts", type=int, default=400, help="tables to learn from (400)")
+    parser.add_argument("--layouts", type=whole(), default=400, help="tables to learn from (400)")
     parser.add_argument(
-        "--held-out-layouts", type=int, default=40, help="tables to measure on (40)", metavar="N"
+        "--held-out-layouts",
+        type=whole(),
+        default=40,
+        help="tables to measure on (40)",
+        metavar="N",
     )
-    parser.add_argument("--steps", type=int, help="optimiser steps (deepjscc 3000, witt 1500)")
-    parser.add_argument("--batch-size", type=int, help="pictures per step (deepjscc 8, witt 4)")
-    parser.add_argument("--learning-rate", type=float, default=1e-3, help="highest (0.001)")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (0)")
-    parser.add_argument("--workers", type=int, default=0, help="simulators (one per core)")
-    parser.add_argument("--threads", type=int, default=1, help="of the training itself (1)")
+    parser.add_argument("--steps", type=whole(), help="optimiser steps (deepjscc 3000, witt 1500)")
+    parser.add_argument("--batch-size", type=whole(), help="pictures per step (deepjscc 8, witt 4)")
+    parser.add_argument("--learning-rate", type=number(), default=1e-3, help="highest (0.001)")
+    parser.add_argument("--seed", type=SEED, default=0, help="of everything random (0)")
+    parser.add_argument(
+        "--workers", type=whole(0, 1024), default=0, help="simulators (one per core)"
+    )
+    parser.add_argument(
+        "--threads", type=whole(1, 1024), default=1, help="of the training itself (1)"
+    )
     parser.add_argument("--json", action="store_true", help="print a summary as JSON at the end")
     parser.set_defaults(run=run)
 

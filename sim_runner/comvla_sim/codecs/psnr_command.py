@@ -7,6 +7,8 @@ import json
 import os
 from pathlib import Path
 
+from comvla.number_arguments import SEED, whole
+
 DESCRIPTION = """\
 PSNR and SSIM of learned codecs over the SNR on held-out tables of the tabletop, beside JPEG in as
 many channel uses under an ideal code, and over bytes. Writes psnr.svg, psnr.png, psnr.json, and
@@ -28,9 +30,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="shipped ones by name, or folders of train codec, a,b,... (deepjscc,witt)",
     )
     parser.add_argument("--data", type=Path, help="frames (runs/codecs/frames-SIZE)")
-    parser.add_argument("--layouts", type=int, default=40, help="held-out tables (40)")
-    parser.add_argument("--pictures", type=int, default=128, help="to measure on (128)")
-    parser.add_argument("--seed", type=int, default=0, help="of fading and noise (0)")
+    parser.add_argument("--layouts", type=whole(), default=40, help="held-out tables (40)")
+    parser.add_argument("--pictures", type=whole(), default=128, help="to measure on (128)")
+    parser.add_argument("--seed", type=SEED, default=0, help="of fading and noise (0)")
     parser.add_argument("--out", type=Path, default=Path("runs/psnr"), help="(runs/psnr)")
     parser.add_argument("--json", action="store_true", help="print the curves as JSON")
     parser.set_defaults(run=run)

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from comvla.number_arguments import number, whole
 from comvla_sim.experiments.errors import EvaluationError
 
 if TYPE_CHECKING:
@@ -42,9 +43,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--out", type=Path, default=Path("runs/demo/demo.html"), help="(runs/demo/demo.html)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of tables and fading (0)")
-    parser.add_argument("--mean-snr-db", type=float, default=10.0, help="of the link, dB (10)")
-    parser.add_argument("--episodes", type=int, default=4, help="instructions to obey (4)")
+    parser.add_argument("--seed", type=whole(), default=0, help="of tables and fading (0)")
+    parser.add_argument(
+        "--mean-snr-db", type=number(-200, 200), default=10.0, help="of the link, dB (10)"
+    )
+    parser.add_argument("--episodes", type=whole(), default=4, help="instructions to obey (4)")
     parser.add_argument("--model", default="mini", help="mini or a checkpoint folder (mini)")
     parser.add_argument("--open", action="store_true", help="show the page in a browser")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

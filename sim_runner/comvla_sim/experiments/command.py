@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from comvla.number_arguments import whole
 from comvla_sim.experiments.errors import EvaluationError
 
 if TYPE_CHECKING:
@@ -66,13 +67,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--k", type=_numbers, default="32", help="tokens sent: 64,32,... (32)")
     parser.add_argument("--condition", type=_names, default="normal", help="see below (normal)")
-    parser.add_argument("--episodes", type=int, default=20, help="layouts per instruction (20)")
-    parser.add_argument("--seed", type=int, default=0, help="chooses the layouts (0)")
+    parser.add_argument("--episodes", type=whole(), default=20, help="layouts per instruction (20)")
+    parser.add_argument("--seed", type=whole(), default=0, help="chooses the layouts (0)")
     parser.add_argument(
         "--instructions", type=_names, help="names or sentences of tasks, a,b,... (all)"
     )
     parser.add_argument("--quantization", default="int8", help="of the tokens on the wire (int8)")
-    parser.add_argument("--workers", type=int, default=0, help="processes (one per core)")
+    parser.add_argument("--workers", type=whole(), default=0, help="processes (one per core)")
     parser.add_argument("--target", metavar="HOST:PORT", help="a running server; else in process")
     parser.add_argument("--out", type=Path, help="results file (a name in runs/eval)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

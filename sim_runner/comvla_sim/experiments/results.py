@@ -32,6 +32,11 @@ def spec_of(row: Mapping[str, Any]) -> EpisodeSpec:
     )
 
 
+def key_of(row: Mapping[str, Any]) -> tuple[str, EpisodeSpec]:
+    """What makes two rows the same measurement: settings (the seed among them) and episode."""
+    return json.dumps(row["settings"], sort_keys=True), spec_of(row)
+
+
 def read_rows(path: Path) -> tuple[list[Row], int]:
     """The rows of a results file, and how many of its bytes hold complete ones.
 
@@ -51,7 +56,7 @@ def read_rows(path: Path) -> tuple[list[Row], int]:
     for number, line in enumerate(content[:complete].splitlines(), start=1):
         try:
             row = json.loads(line)
-            key = (json.dumps(row["settings"], sort_keys=True), spec_of(row))
+            key = key_of(row)
         except (ValueError, KeyError, TypeError) as error:
             raise EvaluationError(
                 f"{path}, line {number} is no result of comvla-sim eval ({error!r}): "

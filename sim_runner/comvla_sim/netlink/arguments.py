@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from comvla.errors import LinkError
+from comvla.number_arguments import SEED, number, whole
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_sim.netlink.link import LinkSettings
 
@@ -18,28 +19,30 @@ def add_channel(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("channel", "SNR in dB, one value for each control period")
     group.add_argument("--channel", choices=CHANNELS, default="rician", help="(rician)")
     group.add_argument(
-        "--snr-db", type=float, default=10.0, metavar="DB", help="mean, or the constant (10)"
+        "--snr-db", type=number(), default=10.0, metavar="DB", help="mean, or the constant (10)"
     )
-    group.add_argument("--rician-k", type=float, default=3.0, metavar="K", help="linear (3)")
-    group.add_argument("--doppler-hz", type=float, default=10.0, metavar="HZ", help="(10)")
+    group.add_argument("--rician-k", type=number(), default=3.0, metavar="K", help="linear (3)")
+    group.add_argument("--doppler-hz", type=number(), default=10.0, metavar="HZ", help="(10)")
     group.add_argument("--trace", type=Path, metavar="FILE", help="CSV, for --channel trace")
-    group.add_argument("--seed", type=int, default=1, help="of the fading (1)")
+    group.add_argument("--seed", type=SEED, default=1, help="of the fading (1)")
 
 
 def add_link(parser: argparse.ArgumentParser) -> None:
     """The radio and what lies behind it."""
     group = parser.add_argument_group("link", "capacity = eta W T log2(1 + SNR) in each period")
-    group.add_argument("--bandwidth-hz", type=float, metavar="HZ", help="W (the scale's own, 20e6)")
     group.add_argument(
-        "--period-s", type=float, default=PAPER_LINK.period_s, metavar="S", help="T (0.05)"
+        "--bandwidth-hz", type=number(), metavar="HZ", help="W (the scale's own, 20e6)"
     )
     group.add_argument(
-        "--efficiency", type=float, default=PAPER_LINK.efficiency, metavar="ETA", help="(0.38)"
+        "--period-s", type=number(), default=PAPER_LINK.period_s, metavar="S", help="T (0.05)"
     )
     group.add_argument(
-        "--delay-ms", type=float, default=0.0, metavar="MS", help="propagation, one way (0)"
+        "--efficiency", type=number(), default=PAPER_LINK.efficiency, metavar="ETA", help="(0.38)"
     )
-    group.add_argument("--mtu", type=int, default=1500, metavar="BYTES", help="(1500)")
+    group.add_argument(
+        "--delay-ms", type=number(), default=0.0, metavar="MS", help="propagation, one way (0)"
+    )
+    group.add_argument("--mtu", type=whole(), default=1500, metavar="BYTES", help="(1500)")
     group.add_argument(
         "--congestion-control", default="cubic", metavar="NAME", help="of both ends (cubic)"
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from comvla.errors import LinkError
+from comvla.number_arguments import SEED, number, whole
 
 _DESCRIPTION = """\
 A real link on this machine: a robot and a cloud in network namespaces of their own, and between them
@@ -59,19 +60,23 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     run_.add_argument(
         "--sending", choices=tuple(POLICIES), default="margin", help="policy of sending (margin)"
     )
-    run_.add_argument("--minutes", type=float, default=1.0, help="how long (1)")
+    run_.add_argument("--minutes", type=number(), default=1.0, help="how long (1)")
     run_.add_argument(
-        "--every", type=int, default=1, metavar="PERIODS", help="from query to query (1)"
+        "--every", type=whole(), default=1, metavar="PERIODS", help="from query to query (1)"
     )
     run_.add_argument(
-        "--csi-delay", type=int, default=0, metavar="PERIODS", help="age of the reported SNR (0)"
+        "--csi-delay",
+        type=whole(),
+        default=0,
+        metavar="PERIODS",
+        help="age of the reported SNR (0)",
     )
     run_.add_argument(
         "--budget", choices=("paper", "framed"), help="what is counted (the policy's own)"
     )
     run_.add_argument(
         "--reserve-ms",
-        type=float,
+        type=number(),
         metavar="MS",
         help="kept of the period for computing and the way back (measured first)",
     )
@@ -85,12 +90,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_link(run_)
 
     flaps = commands.add_parser("flaps", help="cut the link again and again under a robot")
-    flaps.add_argument("--count", type=int, default=50, help="flaps (50)")
-    flaps.add_argument("--shortest-s", type=float, default=0.1, metavar="S", help="(0.1)")
-    flaps.add_argument("--longest-s", type=float, default=3.0, metavar="S", help="(3)")
-    flaps.add_argument("--delay-ms", type=float, default=0.0, metavar="MS", help="one way (0)")
+    flaps.add_argument("--count", type=whole(), default=50, help="flaps (50)")
+    flaps.add_argument("--shortest-s", type=number(), default=0.1, metavar="S", help="(0.1)")
+    flaps.add_argument("--longest-s", type=number(), default=3.0, metavar="S", help="(3)")
+    flaps.add_argument("--delay-ms", type=number(), default=0.0, metavar="MS", help="one way (0)")
     flaps.add_argument(
-        "--deadline-ms", type=float, default=50.0, metavar="MS", help="of a step (50, one period)"
+        "--deadline-ms",
+        type=number(),
+        default=50.0,
+        metavar="MS",
+        help="of a step (50, one period)",
     )
     flaps.add_argument(
         "--at",
@@ -98,7 +107,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         default="cloud",
         help="cloud: packets are lost silently, as in a fade; robot: its device loses the carrier",
     )
-    flaps.add_argument("--seed", type=int, default=0, help="of lengths and moments (0)")
+    flaps.add_argument("--seed", type=SEED, default=0, help="of lengths and moments (0)")
 
     flaps.add_argument(
         "--realtime", action="store_true", help="robot and server run before ordinary processes"

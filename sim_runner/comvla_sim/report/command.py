@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,21 +67,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def read_groups(arguments: list[str]) -> dict[str, list[dict[str, Any]]]:
-    """Rows by group: those of one name, or of equal settings but for the seed.
+    """Rows by group: those of one name, or of equal settings but for the seed. An episode that stands in several
+    files of a group counts once, as the first of them has it.
 
     Raises:
         EvaluationError: a file that is none of results, has no rows, or was measured otherwise than
             the others of its name.
     """
-    from comvla_sim.experiments.results import read_rows
+    from comvla_sim.experiments.results import key_of, read_rows
 
     groups: dict[str, list[dict[str, Any]]] = {}
+    seen: dict[str, set[Any]] = {}
     settings: dict[str, dict[str, Any]] = {}
     for argument in arguments:
         name, _, file = argument.rpartition("=")
         rows, _ = read_rows(Path(file))
         if not rows:
             raise EvaluationError(f"{file} has no results yet: run comvla-sim eval first")
+        repeated = 0
         for row in rows:
             shared = {key: value for key, value in row["settings"].items() if key != "seed"}
             group = name or _name(shared)
@@ -89,7 +93,16 @@ def read_groups(arguments: list[str]) -> dict[str, list[dict[str, Any]]]:
                     f"{file} was measured with other settings than the rest of {group!r}: "
                     "give it a name of its own, NAME=FILE"
                 )
+            if key_of(row) in seen.setdefault(group, set()):
+                repeated += 1
+                continue
+            seen[group].add(key_of(row))
             groups.setdefault(group, []).append(row)
+        if repeated:
+            print(
+                f"{file}: {repeated} of {len(rows)} episodes stand in a file before it and count once",
+                file=sys.stderr,
+            )
     return groups
 
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from comvla.number_arguments import SEED, number, whole
 from comvla_sim.codecs import command as codec_command
 
 if TYPE_CHECKING:
@@ -45,21 +46,29 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--out", type=Path, default=Path("runs/mini"), help="folder of the run")
     parser.add_argument("--data", type=Path, help="demonstrations (default: OUT/demonstrations)")
-    parser.add_argument("--layouts", type=int, default=600, help="tables to learn from (600)")
+    parser.add_argument("--layouts", type=whole(), default=600, help="tables to learn from (600)")
     parser.add_argument(
-        "--validation-layouts", type=int, default=40, help="tables to check on (40)", metavar="N"
+        "--validation-layouts",
+        type=whole(),
+        default=40,
+        help="tables to check on (40)",
+        metavar="N",
     )
-    parser.add_argument("--steps", type=int, default=4000, help="optimiser steps (4000)")
-    parser.add_argument("--seed", type=int, default=0, help="of weights and sampling (0)")
+    parser.add_argument("--steps", type=whole(), default=4000, help="optimiser steps (4000)")
+    parser.add_argument("--seed", type=SEED, default=0, help="of weights and sampling (0)")
     parser.add_argument(
         "--random-share",
-        type=float,
+        type=number(),
         default=0.0,
         metavar="P",
         help="how often kept tokens are random instead of voted (0)",
     )
-    parser.add_argument("--workers", type=int, default=0, help="simulators (one per core)")
-    parser.add_argument("--threads", type=int, default=1, help="of the training itself (1)")
+    parser.add_argument(
+        "--workers", type=whole(0, 1024), default=0, help="simulators (one per core)"
+    )
+    parser.add_argument(
+        "--threads", type=whole(1, 1024), default=1, help="of the training itself (1)"
+    )
     parser.add_argument("--float32", action="store_true", help="no bfloat16 arithmetic")
     parser.add_argument("--json", action="store_true", help="print a summary as JSON at the end")
     parser.set_defaults(run=run)
@@ -142,7 +151,7 @@ def _train(out: Path, data: Path, layouts: int, recipe: Recipe, threads: int) ->
     bounds = pick_statistics(table, None, where=str(data))
     prompt = Prompt(config.prompt, tokenizer)
     sampler = Sampler(train, Tabletop.tasks, prompt, bounds, recipe.seed)
-    trainer = Trainer(config, recipe, out)
+    trainer = Trainer(config, recipe, out, train.digest())
     trainer.resume()
     with training_bar(recipe.steps, trainer.step) as show:
         trainer.run(sampler, lambda progress: show(progress.step, _words(progress)))

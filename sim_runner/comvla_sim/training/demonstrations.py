@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -218,6 +220,13 @@ class Demonstrations:
 
     def __len__(self) -> int:
         return int(self._ends[-1])
+
+    def digest(self) -> str:
+        """Hex digest of how the data set was made and of everything in it but the pictures, which follow from that."""
+        digest = hashlib.sha256(json.dumps(self.manifest, sort_keys=True).encode())
+        for name in sorted(set(ARRAYS) - {"images"}):
+            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        return digest.hexdigest()
 
     def gather_images(self, indices: npt.ArrayLike) -> npt.NDArray[np.uint8]:
         """Pictures of some frames.

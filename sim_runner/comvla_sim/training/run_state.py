@@ -41,11 +41,15 @@ class RunState:
     tensors: dict[str, Tensor]
 
 
-def load_run(folder: Path, recipe: DataclassInstance) -> RunState | None:
+def load_run(folder: Path, recipe: DataclassInstance, data: str | None = None) -> RunState | None:
     """The last checkpoint of a folder; None where there is none.
 
+    Args:
+        folder: of the run. recipe: of the run.
+        data: digest of what it learns from; None where nobody asks.
+
     Raises:
-        TrainingError: the folder belongs to a run with another recipe, or is damaged.
+        TrainingError: the folder belongs to a run with another recipe or on other data, or is damaged.
     """
     notes = folder / _NOTES
     if not notes.is_file():
@@ -61,6 +65,10 @@ def load_run(folder: Path, recipe: DataclassInstance) -> RunState | None:
         raise TrainingError(
             f"{folder} holds a run with another {', '.join(changed)}: choose another folder"
         )
+    if None not in (data, state.get("data")) and state["data"] != data:
+        raise TrainingError(
+            f"{folder} holds a run on other data: name those it began with, or choose another folder"
+        )
     path = folder / f"state-{step}.safetensors"
     try:
         return RunState(step, seconds, load_file(path))
@@ -68,12 +76,19 @@ def load_run(folder: Path, recipe: DataclassInstance) -> RunState | None:
         raise TrainingError(f"cannot read {path} ({error}): choose another folder") from error
 
 
-def save_run(folder: Path, recipe: DataclassInstance, state: RunState) -> None:
+def save_run(
+    folder: Path, recipe: DataclassInstance, state: RunState, data: str | None = None
+) -> None:
     """Writes a checkpoint; the notes name it only once it is whole, and then the older ones go."""
     folder.mkdir(parents=True, exist_ok=True)
     current = folder / f"state-{state.step}.safetensors"
     save_file(state.tensors, current)
-    notes = {"step": state.step, "seconds": state.seconds, "recipe": asdict(recipe)}
+    notes = {
+        "step": state.step,
+        "seconds": state.seconds,
+        "recipe": asdict(recipe),
+        "data": data,
+    }
     partial = folder / f"{_NOTES}.writing"
     partial.write_text(json.dumps(notes))
     partial.replace(folder / _NOTES)

@@ -24,6 +24,7 @@ from comvla_sim.training.run_state import (
     set_optimizer_tensors,
 )
 from comvla_vla.config import ModelConfig
+from comvla_vla.linear import cpu_multiplies_bfloat16
 from comvla_vla.nets import join
 
 __all__ = ["Progress", "Recipe", "Trainer", "TrainingError", "learning_rate"]
@@ -41,7 +42,8 @@ class Recipe:
         token_counts, token_shares: K drawn at each step, and how often.
         random_share: how often the kept tokens are random instead of voted. 0 trains for votes only; 0.5 gives a
             policy on which random selection is a fair control.
-        bfloat16: matrix products in bfloat16 (needs a CPU with such instructions to be faster).
+        bfloat16: matrix products in bfloat16, on processors that have instructions for it; others run in float32,
+            which is many times quicker there.
     """
 
     seed: int = 0
@@ -73,10 +75,13 @@ class Trainer:
     Args:
         config: of the policy. recipe: of the run.
         folder: where checkpoints go (``state.safetensors``, ``state.json``).
+        data: digest of the demonstrations, by which a run that goes on knows them; None where nobody asks.
     """
 
-    def __init__(self, config: ModelConfig, recipe: Recipe, folder: Path) -> None:
-        self.config, self.recipe, self.folder = config, recipe, folder
+    def __init__(
+        self, config: ModelConfig, recipe: Recipe, folder: Path, data: str | None = None
+    ) -> None:
+        self.config, self.recipe, self.folder, self.data = config, recipe, folder, data
         torch.manual_seed(recipe.seed)
         self.learner = Learner(*join(config))
         matrices = [p for p in self.learner.parameters() if p.ndim >= 2]
@@ -93,9 +98,9 @@ class Trainer:
         """Takes up the last checkpoint of this folder; False where there is none.
 
         Raises:
-            TrainingError: the folder belongs to a run with another recipe.
+            TrainingError: the folder belongs to a run with another recipe or other demonstrations.
         """
-        state = load_run(self.folder, self.recipe)
+        state = load_run(self.folder, self.recipe, self.data)
         if state is None:
             return False
         self.step, self.seconds = state.step, state.seconds
@@ -104,7 +109,9 @@ class Trainer:
 
     def save(self) -> None:
         """Writes a checkpoint; the notes name it only once it is whole."""
-        save_run(self.folder, self.recipe, RunState(self.step, self.seconds, self._state()))
+        save_run(
+            self.folder, self.recipe, RunState(self.step, self.seconds, self._state()), self.data
+        )
 
     def run(
         self,
@@ -148,7 +155,8 @@ class Trainer:
         selection = "random" if rng.random() < recipe.random_share else "votes"
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         batch = sampler.batch(self.step, recipe.batch_size)
-        with torch.autocast("cpu", torch.bfloat16, enabled=recipe.bfloat16):
+        narrow = recipe.bfloat16 and cpu_multiplies_bfloat16()
+        with torch.autocast("cpu", torch.bfloat16, enabled=narrow):
             terms: dict[str, Tensor] = self.learner(batch, k, selection, generator)
         loss = terms["action"] + weights.state * terms["state"]
         loss = loss + weights.attention * terms["attention"] + weights.matching * terms["matching"]

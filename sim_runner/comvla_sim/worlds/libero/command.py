@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from comvla.number_arguments import whole
 from comvla_sim.worlds.libero.errors import LiberoError
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     setup.set_defaults(run=_setup)
     expert = actions.add_parser("expert", help="run the scripted expert: is the world right?")
     expert.add_argument("--suite", default="libero_spatial", help="(libero_spatial)")
-    expert.add_argument("--episodes", type=int, default=2, help="initial states per task (2)")
+    expert.add_argument("--episodes", type=whole(), default=2, help="initial states per task (2)")
     expert.add_argument("--tasks", help="numbers of tasks from 0, a,b,... (all)")
     expert.add_argument("--out", type=Path, help="write the episodes here as JSON")
     expert.add_argument("--json", action="store_true", help="print one JSON object")
