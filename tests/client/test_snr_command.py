@@ -108,7 +108,12 @@ def test_mistakes_have_status_2_and_one_line(
 def test_ctrl_c_ends_the_display_quietly() -> None:
     command = [sys.executable, "-m", "comvla_client", "snr", "constant:3", "--interval-s", "60"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # As from a terminal: whoever runs the tests in the background has Ctrl-C ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as display:
         assert display.stdout is not None
         assert display.stderr is not None
