@@ -8,8 +8,8 @@ the last ones did, or went unanswered:
 * a ping is sent over the old connection, and the next call as ever;
 * when the ping is not answered in time, the old connection is given nothing more, and new ones are
   opened beside it, a fresh one every :data:`EVERY_S`: one whose first packet is lost waits a second;
-* whichever speaks first is used: an old connection that is alive needs one round trip to answer the
-  ping, a new one two to be ready. A call that was under way is then made over the new one, too; the
+* whichever answers first is used: an old connection that is alive needs one round trip, a new one
+  three. A call that was under way is then made over the new one, too; the
   server answers both alike.
 
 All of this costs some 100 bytes for the ping and 60 for each attempt that is lost.
@@ -44,7 +44,7 @@ EVERY_S = 0.04
 MOST_SPARES = 8
 """Attempts under way at most. The oldest stays: on a long link an attempt needs time to succeed."""
 
-_LEAST_AGE_S = 0.02
+_LEAST_AGE_S = 0.005
 _REMEMBERED = 9
 _PING_TIMEOUT_S = 30.0
 _NO_ANSWER = (
@@ -138,17 +138,13 @@ class Revival:
         if self._old_one_lives():
             return None
         for spare in self._spares:
-            if spare.ready.is_set():
+            if spare.ready:
                 self._spares.remove(spare)
-                return spare.release()
+                return spare.channel
         return None
 
     def _old_one_lives(self) -> bool:
-        ping = self._ping
-        if ping is None or not ping.done() or ping.cancelled():
-            return False
-        error = ping.exception()
-        return not (isinstance(error, grpc.RpcError) and error.code() in _NO_ANSWER)
+        return self._ping is not None and _answered(self._ping)
 
     def _overdue_s(self) -> float:
         return time.monotonic() - self._pinged - PATIENCE_S
@@ -156,14 +152,18 @@ class Revival:
     def _send_ping(self, current: grpc.Channel) -> None:
         self._pinged = time.monotonic()
         try:
-            stub = policy_pb2_grpc.PolicyServiceStub(current)
-            request = GetModelRequest(protocol_version=PROTOCOL_VERSION)
-            self._ping = stub.GetModel.future(
-                request, timeout=_PING_TIMEOUT_S, metadata=self._metadata()
-            )
+            self._ping = self._ping_over(current)
             self._ping.add_done_callback(lambda _: self.wake())
         except ValueError:  # closed meanwhile; the call that follows will say so
             self._ping = None
+
+    def _ping_over(self, channel: grpc.Channel, *, wait_for_ready: bool = False) -> Any:
+        return policy_pb2_grpc.PolicyServiceStub(channel).GetModel.future(
+            GetModelRequest(protocol_version=PROTOCOL_VERSION),
+            timeout=_PING_TIMEOUT_S,
+            metadata=self._metadata(),
+            wait_for_ready=wait_for_ready,
+        )
 
     def _forget_ping(self) -> None:
         if self._ping is not None:
@@ -173,36 +173,38 @@ class Revival:
     def _open_spare(self, least_age_s: float) -> None:
         if self._spares and time.monotonic() - self._spares[-1].born < least_age_s:
             return
-        self._spares.append(_Spare(self._open_channel(), self.wake))
+        channel = self._open_channel()
+        ping = self._ping_over(channel, wait_for_ready=True)
+        self._spares.append(_Spare(channel, ping, self.wake))
         while len(self._spares) > MOST_SPARES:
-            discard(self._spares.pop(1).release())
+            discard(self._spares.pop(1).channel)
 
     def _drop_spares(self) -> None:
         while self._spares:
-            discard(self._spares.pop().release())
+            discard(self._spares.pop().channel)
 
 
 class _Spare:
-    """A connection that is being opened."""
+    """A connection that is being opened; it is ready when the server has answered over it."""
 
-    def __init__(self, channel: grpc.Channel, wake: Callable[[], None]) -> None:
-        self._channel = channel
-        self._wake = wake
+    def __init__(self, channel: grpc.Channel, ping: Any, wake: Callable[[], None]) -> None:
+        self.channel = channel
         self.born = time.monotonic()
-        self.ready = threading.Event()
-        channel.subscribe(self._notice, try_to_connect=True)
+        self._ping = ping
+        ping.add_done_callback(lambda _: wake())
 
-    def release(self) -> grpc.Channel:
-        """Stops watching; gives the connection."""
-        self._channel.unsubscribe(self._notice)
-        return self._channel
+    @property
+    def ready(self) -> bool:
+        """Whether the server has answered."""
+        return _answered(self._ping)
 
-    def _notice(self, state: grpc.ChannelConnectivity) -> None:
-        if state is grpc.ChannelConnectivity.READY:
-            self.ready.set()
-            self._wake()
-        else:
-            self.ready.clear()
+
+def _answered(ping: Any) -> bool:
+    """Whether a server said anything at all to a ping."""
+    if not ping.done() or ping.cancelled():
+        return False
+    error = ping.exception()
+    return not (isinstance(error, grpc.RpcError) and error.code() in _NO_ANSWER)
 
 
 def discard(channel: grpc.Channel) -> threading.Thread:

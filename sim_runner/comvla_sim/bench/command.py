@@ -1,10 +1,11 @@
-"""``comvla-sim bench transport | edge | batching | model``."""
+"""``comvla-sim bench transport | edge | batching | model | wire | idle``."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import json
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +16,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Registers ``bench`` and its benchmarks."""
     parser = subparsers.add_parser(
         "bench",
-        help="measure transport, edge computations, batching and the model against their limits",
+        help="measure transport, edge computations, batching, model and link against their limits",
         description="Each benchmark measures its own limit in the same run and reports ratios.",
     )
     benches = parser.add_subparsers(dest="bench", required=True, metavar="BENCH")
@@ -34,9 +35,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Runs one benchmark and prints its table, or JSON with ``--json``."""
-    result = {"transport": _transport, "edge": _edge, "batching": _batching, "model": _model}[
-        args.bench
-    ](args)
+    result = {
+        "transport": _transport,
+        "edge": _edge,
+        "batching": _batching,
+        "model": _model,
+        "wire": _wire,
+        "idle": _idle,
+    }[args.bench](args)
     print(json.dumps(result, indent=2) if args.json else _text(result))
     return 0
 
@@ -85,11 +91,42 @@ def _model_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _wire_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--k", dest="token_budgets", type=_token_budgets, metavar="K,K,…", help="(1 to 512)"
+    )
+    parser.add_argument(
+        "--quantization",
+        dest="quantizations",
+        type=lambda text: tuple(text.split(",")),
+        metavar="NAME,…",
+        help="(all)",
+    )
+    _link_options(parser, "as fast as the machine")
+    parser.add_argument("--mtu", dest="mtu_bytes", type=_at_least(576), help="bytes (1500)")
+
+
+def _idle_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--k", dest="token_budget", type=_at_least(1), help="tokens (32)")
+    parser.add_argument("--silence-s", type=float, help="before each query (1.2)")
+    _link_options(parser, "26.3, the paper's link at 10 dB")
+
+
+def _link_options(parser: argparse.ArgumentParser, rate: str) -> None:
+    parser.add_argument("--delay-ms", type=float, help="one way (wire: 0, idle: 20)")
+    parser.add_argument("--mbit-per-s", type=float, help=f"rate of the link ({rate})")
+
+
 _BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
     "transport": ("68 KiB up, 1 KiB down, against raw TCP and a websocket", _transport_options),
     "edge": ("vote, select, quantise, pack, against a matrix product", _edge_options),
     "batching": ("many robots on one server, against batches of one", _batching_options),
     "model": ("one half with random weights, against bare matrix products", _model_options),
+    "wire": ("accounted bytes of a query, against a packet capture (root)", _wire_options),
+    "idle": (
+        "a query after a silence, against one without, remedy by remedy (root)",
+        _idle_options,
+    ),
 }
 
 
@@ -115,6 +152,21 @@ def _model(args: argparse.Namespace) -> dict[str, Any]:
     from comvla_sim.bench import model
 
     return model.run(_given(model.ModelParameters, args))
+
+
+def _wire(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.netlink import wire_bench
+    from comvla_sim.netlink.command import progress
+
+    with progress("queries") as on_query:
+        return wire_bench.run(_given(wire_bench.WireParameters, args), on_query)
+
+
+def _idle(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.netlink import idle_bench
+
+    parameters = _given(idle_bench.IdleParameters, args)
+    return idle_bench.run(parameters, on_case=lambda name: print(name, file=sys.stderr, flush=True))
 
 
 def _given(parameters: Callable[..., Any], args: argparse.Namespace) -> Any:

@@ -7,8 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 
+from comvla.errors import ComVLAError
+
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 20.0
+
+
+class ProcessError(ComVLAError, RuntimeError):
+    """A server process ended, or was not ready in time."""
 
 
 @contextmanager
@@ -24,7 +30,7 @@ def serving(target: Callable[..., None], *arguments: object) -> Iterator[str]:
         What the server announced.
 
     Raises:
-        RuntimeError: it ended, or said nothing within two minutes.
+        ProcessError: it ended, or said nothing within two minutes.
     """
     with connected(target, *arguments) as (_, announcement):
         yield announcement
@@ -38,7 +44,7 @@ def connected(target: Callable[..., None], *arguments: object) -> Iterator[tuple
         This end of the lifeline, and what the process announced.
 
     Raises:
-        RuntimeError: it ended, or said nothing within two minutes.
+        ProcessError: it ended, or said nothing within two minutes.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -73,5 +79,5 @@ def _announcement(lifeline: Connection, name: str) -> str:
         if lifeline.poll(START_TIMEOUT_S):
             return lifeline.recv_bytes().decode()
     except EOFError:
-        raise RuntimeError(f"{name} ended before it served; its own message is above") from None
-    raise RuntimeError(f"{name} was not ready within {START_TIMEOUT_S:.0f} s: is the machine busy?")
+        raise ProcessError(f"{name} ended before it served; its own message is above") from None
+    raise ProcessError(f"{name} was not ready within {START_TIMEOUT_S:.0f} s: is the machine busy?")

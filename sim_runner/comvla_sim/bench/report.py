@@ -13,6 +13,9 @@ _TIMES: dict[str, Callable[[Any], str]] = {
     "products_s": milliseconds,
     "layer_s": milliseconds,
     "hf_layer_s": milliseconds,
+    "p90_s": milliseconds,
+    "worst_s": milliseconds,
+    "bytes_per_query": lambda value: f"{value:.0f}",
 }
 _HEADS = {
     "name": "",
@@ -32,6 +35,18 @@ _HEADS = {
     "requests_per_s": "requests/s",
     "mean_batch": "mean batch",
     "answered": "answered",
+    "p90_s": "p90 ms",
+    "worst_s": "worst ms",
+    "round_trips": "round trips",
+    "bytes_per_query": "bytes a query",
+    "needs_root": "needs root",
+    "queries": "queries",
+    "under": "under",
+    "least_over_percent": "least over %",
+    "most_over_percent": "most over %",
+    "accounted_bytes": "accounted bytes",
+    "captured_bytes": "captured bytes",
+    "repeated_bytes": "sent again",
     "repetitions": "calls",
 }
 
@@ -71,7 +86,18 @@ def _conclusions(result: Mapping[str, Any]) -> list[str]:
         ]
     if result["bench"] == "model":
         return _model_conclusions(result)
+    if result["bench"] == "idle":
+        return _idle_conclusions(result)
     return []
+
+
+def _idle_conclusions(result: Mapping[str, Any]) -> list[str]:
+    trip, wire = milliseconds(result["round_trip_s"]), milliseconds(result["serialisation_s"])
+    return [
+        "",
+        f"round trip {trip} ms, bytes of a query on this link {wire} ms; allowed: "
+        f"{milliseconds(result['allowed_s'])} ms (1.15 round trips and the bytes)",
+    ]
 
 
 def _model_conclusions(result: Mapping[str, Any]) -> list[str]:

@@ -34,6 +34,7 @@ class ServerProcess:
         model: as for ``--model``.
         ready_within_s: longest wait for the line that says ready, seconds.
         host: address to listen on.
+        insecure: listens without encryption also where others might reach it.
         launcher: a program that becomes the one whose command line follows it, e.g. in another
             network namespace.
 
@@ -51,11 +52,13 @@ class ServerProcess:
         *,
         ready_within_s: float = READY_WITHIN_S,
         host: str = "127.0.0.1",
+        insecure: bool = False,
         launcher: Sequence[str] = (),
     ) -> None:
         self._command = [*launcher, sys.executable, "-m", "comvla_server", "serve"]
         self._command += ["--model", model, "--host", host, "--port", "0", "--admin-port", "0"]
         self._command += ["--threads", "1"]
+        self._command += ["--insecure"] if insecure else []
         self._ready_within_s = ready_within_s
         self._process: subprocess.Popen[str] | None = None
         # Closed by stop(); a context manager could not outlive this method.

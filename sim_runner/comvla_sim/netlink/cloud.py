@@ -46,7 +46,7 @@ def cloud_server(namespace: str, model: str, *, realtime: bool = False) -> Itera
     enter_first = [sys.executable, "-m", "comvla_sim.netlink.cloud", namespace]
     if realtime:
         enter_first.append(_REALTIME)
-    with ServerProcess(model, host=CLOUD_ADDRESS, launcher=enter_first) as server:
+    with ServerProcess(model, host=CLOUD_ADDRESS, insecure=True, launcher=enter_first) as server:
         yield server.target
 
 
@@ -59,8 +59,9 @@ def _serve_synthetic(lifeline: Connection, namespace: str, realtime: bool) -> No
     from comvla_server.settings import ServerSettings
     from comvla_sim.netlink.synthetic import SyntheticCloud
 
-    logging.getLogger("comvla_server").setLevel(logging.ERROR)  # it is not open to anyone outside
-    settings = ServerSettings(host=CLOUD_ADDRESS)
+    logging.getLogger("comvla_server").setLevel(logging.ERROR)
+    # The only one who reaches this address is the robot of this link.
+    settings = ServerSettings(host=CLOUD_ADDRESS, insecure=True)
     with BackgroundServer(Engine(SyntheticCloud()), settings) as server:
         announce(lifeline, server.target)
         wait_for_end(lifeline)

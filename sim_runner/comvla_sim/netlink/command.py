@@ -145,7 +145,8 @@ def _up(args: argparse.Namespace) -> int:
         return 0
     print(
         f"link {up['name']} is up.\n"
-        f"  cloud:  ip netns exec {up['cloud']} comvla-server serve --host {up['cloud_address']}\n"
+        f"  cloud:  ip netns exec {up['cloud']} comvla-server serve --host {up['cloud_address']} "
+        "--insecure\n"
         f"  robot:  ip netns exec {up['robot']} comvla doctor {up['cloud_address']}:50051\n"
         f"  down:   comvla-sim link down {up['name']}"
     )
