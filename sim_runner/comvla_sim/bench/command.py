@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from comvla.number_arguments import whole
+from comvla.number_arguments import number, whole
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -103,18 +103,18 @@ def _wire_options(parser: argparse.ArgumentParser) -> None:
         help="(all)",
     )
     _link_options(parser, "as fast as the machine")
-    parser.add_argument("--mtu", dest="mtu_bytes", type=_at_least(576), help="bytes (1500)")
+    parser.add_argument("--mtu", dest="mtu_bytes", type=whole(576), help="bytes (1500)")
 
 
 def _idle_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--k", dest="token_budget", type=_at_least(1), help="tokens (32)")
-    parser.add_argument("--silence-s", type=float, help="before each query (1.2)")
+    parser.add_argument("--k", dest="token_budget", type=whole(1), help="tokens (32)")
+    parser.add_argument("--silence-s", type=number(0.0), help="before each query (1.2)")
     _link_options(parser, "26.3, the paper's link at 10 dB")
 
 
 def _link_options(parser: argparse.ArgumentParser, rate: str) -> None:
-    parser.add_argument("--delay-ms", type=float, help="one way (wire: 0, idle: 20)")
-    parser.add_argument("--mbit-per-s", type=float, help=f"rate of the link ({rate})")
+    parser.add_argument("--delay-ms", type=number(0.0), help="one way (wire: 0, idle: 20)")
+    parser.add_argument("--mbit-per-s", type=number(0.001), help=f"rate of the link ({rate})")
 
 
 _BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
