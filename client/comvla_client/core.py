@@ -30,7 +30,7 @@ from comvla_client.queue import ActionQueue, Actions
 from comvla_client.registry import make_uplink
 from comvla_client.report import PHASES, ActionChunk, FallbackReason, Load, StepReport
 from comvla_client.selection import Selector
-from comvla_client.sending import Outcome, Plan, SendingPolicy, Situation, make_policy
+from comvla_client.sending import Floor, Outcome, Plan, SendingPolicy, Situation, make_policy
 from comvla_client.sizing import Budget, TokenSizer
 from comvla_client.snr import SnrInput, SnrReading, as_reading, as_source
 from comvla_client.streaming import PayloadStream
@@ -95,7 +95,12 @@ class ClientCore:
         if self.sending.progressive and not self._form.in_pieces:
             raise ValueError(
                 f"sending={self.sending.name!r} sends tokens piece by piece, {self._form.name} sends "
-                "pictures, which arrive whole or not at all: choose sending='paper', 'margin' or 'floor'"
+                "pictures, which arrive whole or not at all: choose sending='paper' or 'margin'"
+            )
+        if isinstance(self.sending, Floor) and not self._form.in_pieces:
+            raise ValueError(
+                f"sending={self.sending.name!r} has a floor in tokens, {self._form.name} sends pictures: "
+                "choose sending='paper' or 'margin'"
             )
         self._edge = None if edge is None or isinstance(edge, ModelInfo) else edge
         if self._form.needs_edge and self._edge is None:

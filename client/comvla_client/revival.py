@@ -166,9 +166,9 @@ class Revival:
         )
 
     def _forget_ping(self) -> None:
-        if self._ping is not None:
-            self._ping.cancel()
-            self._ping = None
+        ping, self._ping = self._ping, None
+        if ping is not None:
+            ping.cancel()
 
     def _open_spare(self, least_age_s: float) -> None:
         if self._spares and time.monotonic() - self._spares[-1].born < least_age_s:
@@ -180,8 +180,11 @@ class Revival:
             discard(self._spares.pop(1).channel)
 
     def _drop_spares(self) -> None:
-        while self._spares:
-            discard(self._spares.pop().channel)
+        while True:
+            try:  # two threads may do this at once when a client is closed
+                discard(self._spares.pop().channel)
+            except IndexError:
+                return
 
 
 class _Spare:

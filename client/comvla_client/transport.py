@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any, Protocol
 
 import grpc
@@ -98,6 +99,7 @@ class GrpcTransport:
         self._access = Access(target, tls, token, insecure=insecure)
         self._lock = threading.Lock()
         self._closed = threading.Event()
+        self._calls = 0
         self._revival = Revival(self._new_channel, self._access.metadata)
         self._channel = self._new_channel()
 
@@ -134,20 +136,23 @@ class GrpcTransport:
             TransportError: no usable answer within ``timeout_s`` seconds.
             ClientClosedError: the transport is closed, before or during the call.
         """
-        stopped = threading.Event()
+        # Each attempt counts its own pieces and is stopped at the end only: to half-close an earlier
+        # one would tell the server to answer what little it has, and that answer might win.
+        attempts: list[tuple[PayloadStream, threading.Event]] = []
 
         def start(stub: Any, remaining_s: float, metadata: Metadata) -> Any:
-            nonlocal stopped
-            stopped.set()
-            stopped = threading.Event()
-            messages = paced(stream, min(stream.window_s, remaining_s), stopped)
+            attempt, stopped = replace(stream), threading.Event()
+            attempts.append((attempt, stopped))
+            messages = paced(attempt, min(stream.window_s, remaining_s), stopped)
             return stub.InferProgressive.future(messages, timeout=remaining_s, metadata=metadata)
 
         try:
             with self._warmed(stream.head.ByteSize() + len(stream.payload)):
                 answer: InferResponse = self._call(start, timeout_s).response
         finally:
-            stopped.set()  # the thread that feeds gRPC may be waiting for its next piece
+            for attempt, stopped in attempts:
+                stopped.set()  # the thread that feeds gRPC may be waiting for its next piece
+                stream.taken = max(stream.taken, attempt.taken)
         return answer
 
     def close(self) -> None:
@@ -158,6 +163,9 @@ class GrpcTransport:
         self._revival.wake()
         with self._lock:
             closing = discard(self._channel)
+            idle = self._calls == 0
+        if idle:  # else the call under way does it when it ends
+            self._revival.reset()
         closing.join(_CLOSE_WITHIN_S)
 
     @property
@@ -166,6 +174,18 @@ class GrpcTransport:
         return 0 if self._warm_up is None else self._warm_up.sent_bytes
 
     def _call(self, start: Start, timeout_s: float) -> Any:
+        with self._lock:
+            self._calls += 1
+        try:
+            return self._attempts(start, timeout_s)
+        finally:
+            with self._lock:
+                self._calls -= 1
+                idle = self._calls == 0
+            if idle and self._closed.is_set():
+                self._revival.reset()
+
+    def _attempts(self, start: Start, timeout_s: float) -> Any:
         attempts = channel.Attempts(timeout_s)
         while True:
             try:

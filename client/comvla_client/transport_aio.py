@@ -46,7 +46,10 @@ class AsyncProgressiveTransport(AsyncTransport, Protocol):
 
 
 class GrpcAioTransport:
-    """:class:`comvla_client.transport.GrpcTransport` on the running event loop; the same rules.
+    """:class:`comvla_client.transport.GrpcTransport` on the running event loop.
+
+    It makes a new connection after two calls in a row without an answer. It does not look for one
+    while a call is under way (:mod:`comvla_client.revival`), and sends no filler.
 
     Args:
         target: ``host:port``.

@@ -169,6 +169,12 @@ DASHBOARDS: dict[str, tuple[str, list[Panel]]] = {
                 ],
             ),
             Panel(
+                "Turned away at the door",
+                "reqps",
+                [(by("reason", "comvla_calls_refused_total"), "{{reason}}")],
+                "Calls refused before they were read: no or a wrong token, above a rate.",
+            ),
+            Panel(
                 "Batch size",
                 "none",
                 [

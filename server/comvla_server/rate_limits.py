@@ -149,9 +149,10 @@ class RateLimits:
             now_s = self._clock()
             requests = TokenBucket.full(rates[0], 1.0, now_s)
             size = TokenBucket.full(rates[1], 1.0, now_s)
-            open_calls = 0 if account is None else account.open_calls
-            account = _Account(rates, requests, size, open_calls)
-            self._accounts[identity.name] = account
+            if account is None:
+                account = self._accounts[identity.name] = _Account(rates, requests, size, 0)
+            else:  # in place: calls that are open will be counted off this very account
+                account.rates, account.requests, account.size = rates, requests, size
             if len(self._accounts) > _MOST_REMEMBERED:
                 self._accounts.popitem(last=False)
         self._accounts.move_to_end(identity.name)

@@ -99,6 +99,9 @@ class Watcher:
         # Nothing seen yet, so the first look reads everything once more: a file may have changed
         # between its first reading and now.
         self._seen: dict[str, list[tuple[int, ...] | None]] = {}
+        # What was no good is tried at every look, since the cause may lie elsewhere (a clock, a
+        # limit of open files), but told once.
+        self._refused: dict[str, list[tuple[int, ...] | None]] = {}
 
     async def run(self) -> None:
         """Watches until it is cancelled."""
@@ -112,10 +115,12 @@ class Watcher:
             stamps, before = _stamps(item.paths), self._seen.get(name)
             if stamps == before:
                 continue
-            self._seen[name] = stamps
             try:
                 item.reload()
             except Exception as error:  # whatever it is, it must not end the watch
+                if self._refused.get(name) == stamps:
+                    continue
+                self._refused[name] = stamps
                 self._failed(name)
                 told = isinstance(error, ComVLAError)
                 _log.error(
@@ -125,7 +130,8 @@ class Watcher:
                     exc_info=not told,
                 )
             else:
-                if before is not None:
+                self._seen[name] = stamps
+                if self._refused.pop(name, None) is not None or before is not None:
                     _log.info("%s reloaded", name)
 
 

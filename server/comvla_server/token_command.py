@@ -127,14 +127,17 @@ def _revoke(args: argparse.Namespace) -> int:
 def _write(path: Path, text: str) -> None:
     """Replaces the file in one step: a server that looks meanwhile sees the old or the new one."""
     try:
-        mode = path.stat().st_mode & 0o777 if path.exists() else 0o600
+        before = path.stat() if path.exists() else None
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
             with os.fdopen(descriptor, "w") as file:
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
-            os.chmod(temporary, mode)
+            if before is not None:
+                # The server that reads it may be another user than the one who edits it.
+                os.chown(temporary, before.st_uid, before.st_gid)
+            os.chmod(temporary, 0o600 if before is None else before.st_mode & 0o777)
             os.replace(temporary, path)
         except BaseException:
             os.unlink(temporary)

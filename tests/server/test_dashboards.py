@@ -122,6 +122,14 @@ def test_promtool_agrees(arguments: tuple[str, ...]) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_services_do_not_set_the_servers_variables() -> None:
+    # A service called comvla makes Kubernetes set COMVLA_PORT=tcp://…, which is no port.
+    services = (DOCKER / "kubernetes" / "service.yaml").read_text()
+    assert "name: comvla\n" in services
+    deployment = (DOCKER / "kubernetes" / "deployment.yaml").read_text()
+    assert "enableServiceLinks: false" in deployment
+
+
 def test_every_alert_has_a_test() -> None:
     named = r"alert(?:name)?: (\w+)"
     alerts = set(re.findall(named, (DOCKER / "prometheus" / "alerts.yml").read_text()))

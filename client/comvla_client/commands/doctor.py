@@ -130,7 +130,7 @@ def examine(arguments: argparse.Namespace) -> Iterator[Finding]:
         raise LinkError(f"expected --seconds > 0, got {arguments.seconds}: how long it may take")
     target = access.target
     allowance = Allowance(arguments.seconds)
-    yield _torch()
+    yield _torch(arguments.edge is not None)
     reached, path = reach.reach(target, allowance.at_most_s(arguments.connect_timeout_s))
     yield reached
     if path is None:
@@ -206,9 +206,13 @@ def _beyond(
         yield silent.finding(allowance)
 
 
-def _torch() -> Finding:
+def _torch(wanted: bool) -> Finding:
     if importlib.util.find_spec("torch") is not None:
         return Finding("torch", "ok", "installed, so an edge model can run here")
+    # A robot that sends pictures needs none.
     return Finding(
-        "torch", "fail", "not installed", "to run an edge model here: pip install 'comvla[edge]'"
+        "torch",
+        "fail" if wanted else "note",
+        "not installed",
+        "to run an edge model here: pip install 'comvla[edge]'",
     )
