@@ -19,7 +19,15 @@ MAINS: dict[str, Callable[[list[str]], int]] = {
     "comvla-sim": comvla_sim.cli.main,
 }
 # Checked where they belong together, see below.
-CHECKED_LATER = {"--bandwidth-hz", "--period-s", "--efficiency", "--reserve-s", "--interval-s"}
+CHECKED_LATER = {
+    "--seconds",
+    "--every-s",
+    "--bandwidth-hz",
+    "--period-s",
+    "--efficiency",
+    "--reserve-s",
+    "--interval-s",
+}
 NONSENSE = ("nan", "abc", "", "1e", "0x10", "9" * 5000)
 
 
@@ -58,6 +66,8 @@ def test_nonsense_is_refused_where_it_is_read(option: str) -> None:
         "comvla step 127.0.0.1:1 --proprio inf 0",
         "comvla step 127.0.0.1:1 --seed -1",
         "comvla step 127.0.0.1:1 --snr-db nan",
+        "comvla step 127.0.0.1:1 --every-s nan",
+        "comvla step 127.0.0.1:1 --repeat -1",
         "comvla step 127.0.0.1:1 --bandwidth-hz nan",
         "comvla step 127.0.0.1:1 --period-s inf",
         "comvla doctor 127.0.0.1:1 --connect-timeout-s nan",

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 
 from comvla.errors import LinkError
-from comvla.number_arguments import SECONDS, whole
+from comvla.number_arguments import whole
 from comvla_client.access import Access
 from comvla_client.commands.arguments import (
     Subparsers,
@@ -55,7 +55,7 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     add_target(parser)
     parser.add_argument(
         "--seconds",
-        type=SECONDS,
+        type=float,
         default=15.0,
         metavar="S",
         help="longest that the examination may take, loading --edge aside (default: %(default)s)",

@@ -104,14 +104,14 @@ def add_parser(subparsers: Subparsers) -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=SEED, default=0, help="of the synthetic observation")
     parser.add_argument(
         "--repeat",
-        type=whole(0),
+        type=int,
         default=1,
         metavar="N",
         help="send N times as one robot, 0 without end (default: %(default)s)",
     )
     parser.add_argument(
         "--every-s",
-        type=number(0, 1e6),
+        type=float,
         default=0.4,
         metavar="S",
         help="seconds from one to the next (default: %(default)s, chunks of eight at 20 Hz)",
