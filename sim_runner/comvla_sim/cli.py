@@ -18,6 +18,7 @@ COMMANDS = {
     "eval": "comvla_sim.experiments.command",
     "train": "comvla_sim.training.command",
     "report": "comvla_sim.report.command",
+    "figure": "comvla_sim.figures.command",
     "psnr": "comvla_sim.codecs.psnr_command",
     "bench": "comvla_sim.bench.command",
     "link": "comvla_sim.netlink.command",

@@ -21,9 +21,12 @@ from comvla_client.transport import Transport
 from comvla_sim.link_records import LinkRecord, PeriodRecord
 from comvla_sim.radio import Radio
 
-__all__ = ["COUNTS", "MODES", "EnforcedLink", "LinkRecord", "PeriodRecord"]
+__all__ = ["COUNTS", "MODES", "UNENFORCED", "EnforcedLink", "LinkRecord", "PeriodRecord"]
 
 MODES = ("prefix", "drop", "queue")
+UNENFORCED = "none"
+"""The mode of a link that withholds nothing."""
+
 COUNTS = ("framed", "encoded")
 
 
@@ -59,7 +62,8 @@ class EnforcedLink:
         mode: what happens to a payload that does not fit into its period. ``"prefix"`` cuts it
             after the last byte that does, and what arrived is used; ``"drop"`` loses it whole;
             ``"queue"`` goes on in the next periods while the robot waits, and the answer comes
-            late. A payload in pieces is cut in every mode when its window ends.
+            late. A payload in pieces is cut in these three when its window ends. ``"none"`` lets
+            everything through at once, as the paper's simulation does, and only keeps the records.
         count: what takes up capacity: ``"framed"`` is every byte of the call on the wire (protobuf,
             gRPC, HTTP/2 frames and headers); ``"encoded"`` the coded payload alone.
         patience_periods: with ``"queue"``, periods that the robot waits for an answer, the one in
@@ -80,13 +84,13 @@ class EnforcedLink:
         channel: Iterable[float],
         link: LinkProfile,
         *,
-        mode: Literal["prefix", "drop", "queue"] = "prefix",
+        mode: Literal["prefix", "drop", "queue", "none"] = "prefix",
         count: Literal["framed", "encoded"] = "framed",
         patience_periods: int = 8,
         buffer_bytes: int = 16_384,
     ) -> None:
-        if mode not in MODES:
-            raise LinkError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
+        if mode not in (*MODES, UNENFORCED):
+            raise LinkError(f"mode must be one of {', '.join((*MODES, UNENFORCED))}, got {mode!r}")
         if count not in COUNTS:
             raise LinkError(f"count must be one of {', '.join(COUNTS)}, got {count!r}")
         if patience_periods < 1 or buffer_bytes < 0:
@@ -196,7 +200,7 @@ class EnforcedLink:
         header = codec.read_header(request.payload)
         periods = self._patience_periods if self._mode == "queue" else self._span(window_s)
         asked = _Asked(self)
-        carried_bytes = self._radio.carry(offered_bytes, periods)
+        carried_bytes = self._carry(offered_bytes, periods)
         kept_bytes = 0
         if carried_bytes == offered_bytes:
             kept_bytes = length
@@ -223,7 +227,7 @@ class EnforcedLink:
             offered_bytes = codec.wire_bytes(request.ByteSize()) + codec.CALL_HEADERS_BYTES
         periods = self._patience_periods if self._mode == "queue" else self._span(window_s)
         asked = _Asked(self)
-        carried_bytes = self._radio.carry(offered_bytes, periods)
+        carried_bytes = self._carry(offered_bytes, periods)
         self._radio.give_up()
         self._note(asked, offered_bytes, carried_bytes, 0, 0)
         if carried_bytes < offered_bytes:
@@ -240,7 +244,7 @@ class EnforcedLink:
         costs = self._piece_costs(stream)
         header = codec.read_header(stream.payload)
         asked = _Asked(self)
-        carried_bytes = self._radio.carry(costs[-1], self._span(stream.window_s))
+        carried_bytes = self._carry(costs[-1], self._span(stream.window_s))
         kept_bytes = self._radio.give_up()
         whole = [*costs[:-1], costs[-1] - codec.HTTP2_END_BYTES * (self._count == "framed")]
         arrived = bisect.bisect_right(whole, carried_bytes)
@@ -256,6 +260,11 @@ class EnforcedLink:
     def close(self) -> None:
         """Closes the wrapped transport."""
         self._transport.close()
+
+    def _carry(self, offered_bytes: int, periods: int) -> int:
+        if self._mode == UNENFORCED:
+            return offered_bytes
+        return self._radio.carry(offered_bytes, periods)
 
     def _span(self, window_s: float) -> int:
         return periods_of(window_s, self._link.period_s, self._link.reserve_s)

@@ -12,6 +12,7 @@ from comvla import codec
 from comvla.model_info import ModelInfo
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
 from comvla_client.transport import Transport
+from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.training.recording import clean_chunk
 from comvla_sim.worlds import World
 from comvla_vla import PolicyRequest
@@ -68,31 +69,52 @@ SETTINGS: dict[str, Any] = {
     "model": "comvla-mini",
     "model_fingerprint": "0123456789abcdef",
     "quantization": "int8",
-    "link": "ideal",
     "versions": {"comvla": "0.1.0"},
 }
+
+
+def made_up_link_use(overruns: Sequence[float]) -> dict[str, Any]:
+    """What became of an episode's queries: two more of them sent nothing."""
+    lost = sum(ratio > 1 for ratio in overruns)
+    return {
+        "sent": len(overruns),
+        "answered": len(overruns) - lost,
+        "lost": lost,
+        "no_link": 2,
+        "waited_periods": 0,
+        "held_periods": lost + 2,
+        "offered_bytes": 1000 * len(overruns),
+        "delivered_bytes": 800 * len(overruns),
+        "offered_tokens": 10 * len(overruns),
+        "delivered_tokens": 8 * len(overruns),
+        "overruns": list(overruns),
+        "payload_overruns": [ratio / 2 for ratio in overruns],
+    }
 
 
 def made_up_row(
     *,
     condition: str = "normal",
     method: str = "hard_voting",
-    k: int = 16,
+    k: int | None = 16,
     task: str = "drawer-open",
     episode: int = 0,
     success: bool = True,
     other_success: bool = False,
+    link: LinkCase | None = None,
+    overruns: Sequence[float] = (0.5, 0.9, 1.5, 4.0),
     **settings: Any,
 ) -> dict[str, Any]:
     """A row as ``comvla-sim eval`` writes it, with chosen outcome."""
     seed = {**SETTINGS, **settings}["seed"]
     return {
-        "format": 1,
+        "format": 2,
         "condition": condition,
         "method": method,
         "k": k,
         "task": task,
         "episode": episode,
+        "link": None if link is None else link.to_dict(),
         "layout_seed": 1_000_000 + 10_000 * seed + episode,
         "instruction": f"please {task}",
         "spoken": f"please {task}",
@@ -103,11 +125,11 @@ def made_up_row(
         "steps": 80 if success else 160,
         "queries": 10,
         "fallbacks": 0,
-        "payload_bytes": 960 * k,
-        "encoded_bytes": 1020 * k,
-        "framed_bytes": 1020 * k + 1000,
+        "payload_bytes": 960 * (k or 10),
+        "encoded_bytes": 1020 * (k or 10),
+        "framed_bytes": 1020 * (k or 10) + 1000,
         "edge_flops": 1e9,
-        "cloud_flops": 1e7 * k,
+        "cloud_flops": 1e7 * (k or 10),
         "selection": {
             "frames": 10,
             "distinct_votes": 90,
@@ -117,6 +139,8 @@ def made_up_row(
             "object_frames_by_view": [10, 8],
             "object_hits_by_view": [9, 6],
         },
+        "channel_seed": None if link is None else 17,
+        "link_use": None if link is None else made_up_link_use(overruns),
         "wall_s": 0.5,
         "settings": {**SETTINGS, **settings},
         "environment": {"command": "comvla-sim eval", "versions": {"torch": "2.13.0"}},

@@ -246,6 +246,75 @@ def test_a_trace_that_is_none_names_the_line(tmp_path: Path, text: str, message:
         TraceChannel(path)
 
 
+def timed_trace(path: Path, times: list[float | str], values: list[float]) -> Path:
+    rows = zip(times, values, strict=True)
+    path.write_text("time_s,snr_db\n" + "".join(f"{t},{v}\n" for t, v in rows))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([0.0, 0.05, 0.04, 0.15], r"line 4.*backwards.*0.05 s and then 0.04 s"),
+        ([0.0, 0.05, 0.05, 0.15], r"line 4.*stands still"),
+        ([0.0, 0.05, 0.1, 0.25], r"line 5.*gap of 0.15 s.*max_gap_s"),
+        ([0.0, "nan", 0.1, 0.15], r"line 3.*time in seconds"),
+        ([0.0, "soon", 0.1, 0.15], r"line 3.*time in seconds"),
+        ([0.0, 0.05, "inf", 0.15], r"line 4.*time in seconds"),
+    ],
+)
+def test_times_that_leave_something_out_are_refused_by_line(
+    tmp_path: Path, times: list[float | str], message: str
+) -> None:
+    path = timed_trace(tmp_path / "t.csv", times, [1.0, 2.0, 3.0, 4.0])
+    for period_s in (None, 0.05):
+        with pytest.raises(LinkError, match=message):
+            TraceChannel(path, period_s=period_s)
+
+
+def test_a_gap_that_is_allowed_is_bridged_by_the_last_value(tmp_path: Path) -> None:
+    path = timed_trace(tmp_path / "t.csv", [0.0, 0.05, 0.1, 0.25, 0.3], [1.0, 2.0, 3.0, 4.0, 5.0])
+    channel = TraceChannel(path, period_s=0.05, max_gap_s=0.2)
+    assert channel.snr_db(len(channel)).tolist() == [1.0, 2.0, 3.0, 3.0, 3.0, 4.0, 5.0]
+    with pytest.raises(LinkError, match="max_gap_s"):
+        TraceChannel(path, max_gap_s=math.nan)
+
+
+@given(
+    step_s=st.sampled_from([0.01, 0.02, 0.05, 0.1, 0.25, 1.0]),
+    period_s=st.sampled_from([0.02, 0.05, 0.1]),
+    count=st.integers(2, 60),
+    begin_s=st.sampled_from([0.0, 17.3, -5.0]),
+)
+def test_a_period_has_the_latest_value_measured_before_it(
+    tmp_path_factory: pytest.TempPathFactory,
+    step_s: float,
+    period_s: float,
+    count: int,
+    begin_s: float,
+) -> None:
+    values = [float(i) for i in range(count)]
+    times = [round(begin_s + i * step_s, 6) for i in range(count)]
+    path = timed_trace(tmp_path_factory.mktemp("trace") / "t.csv", list(times), values)
+    channel = TraceChannel(path, period_s=period_s)
+    assert len(channel) == max(1, round(count * step_s / period_s * 1e6) // 1_000_000)
+    ratio = period_s / step_s
+    expected = [math.floor(t * ratio + 1e-6) for t in range(len(channel))]
+    assert channel.snr_db(len(channel)).tolist() == expected
+
+
+def test_a_trace_may_begin_anywhere_and_comes_round(tmp_path: Path) -> None:
+    path = tmp_path / "trace.txt"
+    path.write_text("1\n2\n3\n")
+    assert TraceChannel(path, start=2).snr_db(4).tolist() == [3.0, 1.0, 2.0, 3.0]
+    assert TraceChannel(path, start=7).snr_db(2).tolist() == [2.0, 3.0]
+
+
+def test_one_timed_value_is_a_trace(tmp_path: Path) -> None:
+    path = timed_trace(tmp_path / "t.csv", [3.0], [-math.inf])
+    assert TraceChannel(path, period_s=0.05).snr_db(2).tolist() == [-math.inf, -math.inf]
+
+
 def test_a_missing_trace_is_a_link_error(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match="cannot read"):
         TraceChannel(tmp_path / "missing.txt")

@@ -15,6 +15,7 @@ from comvla import codec
 from comvla.errors import LinkError
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
 from comvla_client import LinkProfile, TransportError, framed_token_budget
+from comvla_client.streaming import PayloadStream
 from comvla_sim.channel import ConstantChannel, RayleighChannel
 from comvla_sim.link import EnforcedLink
 
@@ -116,6 +117,26 @@ def test_drop_loses_a_payload_whole_that_prefix_would_cut() -> None:
     link.advance()
     link.infer(request_of(20), 1.0)
     assert len(receiver.arrived) == 1
+
+
+@pytest.mark.parametrize("snr_db", [10.0, -20.0, -math.inf])
+def test_without_enforcement_everything_arrives_at_once_and_is_written_down(snr_db: float) -> None:
+    receiver, request = Receiver(), request_of(200)
+    link = EnforcedLink(receiver, ConstantChannel(snr_db), LINK, mode="none")
+    link.infer(request, 1.0)
+    stream = PayloadStream(with_payload(request, 0), request.payload, [len(request.payload)], 0.05)
+    link.infer_progressive(stream, 1.0)
+    assert receiver.arrived == [request, request]
+    assert stream.taken == 1
+    pictures = with_payload(request, 0)
+    pictures.images.views.add(data=bytes(90_000), height=16, width=16)
+    link.infer(pictures, 1.0)
+    assert receiver.arrived[2] == pictures
+    assert link.period == 0
+    for record in link.log:
+        assert record.overrun
+        assert record.delivered_tokens == record.offered_tokens
+        assert record.delivered_bytes == record.offered_bytes
 
 
 def test_a_payload_sized_by_all_its_bytes_always_arrives_whole() -> None:

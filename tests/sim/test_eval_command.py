@@ -101,7 +101,7 @@ def test_ctrl_c_leaves_a_file_that_the_same_command_completes(
         yield interrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(command, "_bar", interrupting)
+        patch.setattr(command, "episode_bar", interrupting)
         assert evaluate(out, *options) == 130
     assert len(read(out)) == 1
     assert str(out) in capsys.readouterr().err
@@ -163,6 +163,75 @@ def test_nonsense_is_refused_before_anything_runs(
     assert evaluate(out, *options) == 2
     error = capsys.readouterr().err
     assert error.startswith("comvla-sim: ")
+    assert message in error
+    assert "Traceback" not in error
+    assert not out.exists()
+
+
+LINK = ("--channel", "rician", "--mean-snr-db", "10", "--csi-delay", "1", "--enforce", "prefix")
+
+
+def test_episodes_over_a_link_are_measured_resumed_and_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "results.jsonl"
+    options = ("--method", "full,hard_voting", "--instructions", "drawer-open", "--json")
+    assert evaluate(out, *options, *LINK, "--sending", "paper,progressive") == 0
+    printed = json.loads(capsys.readouterr().out)
+    found = {(a["method"], a["k"], a["link"]["sending"]) for a in printed["aggregate"]}
+    sendings = ("paper", "progressive")
+    assert found == {("full", 512, s) for s in sendings} | {
+        ("hard_voting", None, s) for s in sendings
+    }
+    for line in printed["aggregate"]:
+        assert line["link"]["bandwidth_hz"] == 0.88e6
+        assert line["link_use"]["sent"] + line["link_use"]["no_link"] == line["queries"]
+    lines = read(out)
+    assert {line["format"] for line in lines} == {2}
+    assert all(line["channel_seed"] is not None for line in lines)
+    # Another link, and none at all, go into the same file.
+    assert evaluate(out, *options, *LINK, "--csi-delay", "0", "--bandwidth-hz", "2e5") == 0
+    assert evaluate(out, *options, "--k", "16") == 0
+    assert evaluate(out, *options, *LINK, "--sending", "paper,progressive") == 0
+    assert len(read(out)) == 2 * (4 + 2 + 2)
+    report = tmp_path / "report"
+    assert cli.main(["report", str(out), "--out", str(report)]) == 0
+    text = (report / "report.md").read_text()
+    assert "hard_voting over rician 10 dB, d=1, prefix, progressive" in text
+    assert "K = link" in text
+
+
+def test_the_terminal_names_links(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--method", "hard_voting", "--instructions", "drawer-open")
+    assert evaluate(tmp_path / "results.jsonl", *options, *LINK) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "rician 10 dB" in shown
+    assert "link" in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--csi-delay", "1"), "add --channel"),
+        (("--link-budget", "paper"), "--link-budget"),
+        (("--channel", "fog"), "--channel 'fog'"),
+        (("--channel", ","), "--channel is empty"),
+        (("--channel", "trace:/nowhere.csv"), "/nowhere.csv"),
+        ((*LINK, "--enforce", "kindly"), "--enforce 'kindly'"),
+        ((*LINK, "--sending", "pigeon"), "--sending 'pigeon'"),
+        ((*LINK, "--csi-delay", "-1"), "--csi-delay"),
+        ((*LINK, "--bandwidth-hz", "-5"), "bandwidth_hz"),
+        ((*LINK, "--efficiency", "0"), "efficiency"),
+        ((*LINK, "--rician-k", "-1"), "rician_k"),
+        (("--k", "link"), "choose a --channel"),
+    ],
+)
+def test_a_link_that_makes_no_sense_is_refused_before_anything_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], message: str
+) -> None:
+    out = tmp_path / "results.jsonl"
+    assert evaluate(out, *options) == 2
+    error = capsys.readouterr().err
     assert message in error
     assert "Traceback" not in error
     assert not out.exists()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from eval_stubs import SETTINGS, made_up_row
 
 from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.results import ResultsFile, read_rows, spec_of
 
 
@@ -61,7 +63,7 @@ def test_two_evaluations_cannot_write_one_file(tmp_path: Path) -> None:
         (b'{"format": 1}\n', "line 1"),
         (b"[1, 2]\n", "line 1"),
         (b"\xff\xfe\n", "line 1"),
-        (json.dumps({**made_up_row(), "format": 99}).encode() + b"\n", "format 99"),
+        (json.dumps({**made_up_row(), "format": 99}).encode() + b"\n", "format 99.*1 and 2"),
     ],
 )
 def test_a_file_of_something_else_is_left_alone(
@@ -72,6 +74,45 @@ def test_a_file_of_something_else_is_left_alone(
     with pytest.raises(EvaluationError, match=message):
         ResultsFile(path, SETTINGS)
     assert path.read_bytes() == content
+
+
+def old_row() -> dict[str, Any]:
+    """A row as format 1 had it, which knew no link."""
+    row = made_up_row()
+    settings = {**row["settings"], "link": "ideal"}
+    old = {k: v for k, v in row.items() if k not in ("link", "channel_seed", "link_use")}
+    return {**old, "format": 1, "settings": settings}
+
+
+def test_rows_of_format_1_are_read_and_continued(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    path.write_text(json.dumps(old_row()) + "\n")
+    with ResultsFile(path, SETTINGS) as results:
+        assert list(results) == [made_up_row()]
+        results.append(made_up_row(episode=1))
+    assert [row["episode"] for row in read_rows(path)[0]] == [0, 1]
+
+
+def test_the_link_is_part_of_the_episode(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    links = (None, LinkCase(), LinkCase(mean_snr_db=5.0))
+    with ResultsFile(path, SETTINGS) as results:
+        for link in links:
+            results.append(made_up_row(k=None if link else 16, link=link))
+    with ResultsFile(path, SETTINGS) as results:
+        assert [spec.link for spec in results.rows] == list(links)
+        assert [spec.k for spec in results.rows] == [16, None, None]
+
+
+def test_a_link_of_a_later_version_is_refused_and_of_an_earlier_one_has_defaults(
+    tmp_path: Path,
+) -> None:
+    row = made_up_row(link=LinkCase())
+    path = tmp_path / "results.jsonl"
+    path.write_text(json.dumps({**row, "link": {**row["link"], "warp": 9}}) + "\n")
+    with pytest.raises(EvaluationError, match="warp"):
+        read_rows(path)
+    assert LinkCase.from_dict({"channel": "rayleigh"}) == LinkCase("rayleigh")
 
 
 def test_a_folder_or_a_missing_file_is_no_results_file(tmp_path: Path) -> None:

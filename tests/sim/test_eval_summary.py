@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 from eval_stubs import made_up_row
 
+from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.statistics import wilson_interval
 from comvla_sim.experiments.summary import summarise
 
@@ -75,6 +79,66 @@ def test_what_is_compared_is_what_differs_in_one_thing() -> None:
         *((voting[k], random[k]) for k in (32, 16)),
         (voting[16], ("wrong_selection", "hard_voting", 16)),
     }
+
+
+LINK = LinkCase("rician", 5.0, enforce="drop")
+
+
+def test_links_are_told_apart_and_their_uses_compared() -> None:
+    links = {
+        "late": replace(LINK, csi_delay=1),
+        "now": LINK,
+        "cut": replace(LINK, enforce="prefix"),
+        "both": replace(LINK, enforce="prefix", csi_delay=1),
+        "good": replace(LINK, mean_snr_db=20.0),
+    }
+    rows = [
+        made_up_row(method=method, k=None, link=link, success=name != "late")
+        for name, link in links.items()
+        for method in ("hard_voting", "random")
+    ]
+    summary = summarise([*rows, made_up_row(method="full", k=512)])
+    names = {link: name for name, link in links.items()}
+
+    def name(entry: dict[str, Any]) -> str:
+        return names[LinkCase.from_dict(entry["link"])] if entry["link"] else "ideal"
+
+    assert sorted(name(line) for line in summary["aggregate"]) == sorted([*links, *links, "ideal"])
+    compared = {
+        tuple(sorted((name(test["first"]), name(test["second"]))))
+        for test in summary["comparisons"]
+        if test["first"]["method"] == test["second"]["method"]
+    }
+    # One thing differs in how the link is used; another mean SNR is another link.
+    assert compared == {("late", "now"), ("cut", "now"), ("both", "cut"), ("both", "late")}
+    methods = [t for t in summary["comparisons"] if t["first"]["method"] != t["second"]["method"]]
+    assert {name(test["first"]) for test in methods} == set(links)
+    assert all(test["first"]["link"] == test["second"]["link"] for test in methods)
+
+
+def test_what_a_link_did_is_summed_and_its_overruns_have_percentiles() -> None:
+    rows = [
+        made_up_row(k=None, link=LINK, episode=0, overruns=(0.5, 0.9, 1.0)),
+        made_up_row(k=None, link=LINK, episode=1, overruns=(1.1, 3.0, 7.0, 0.2)),
+    ]
+    (line,) = summarise(rows)["aggregate"]
+    use = line["link_use"]
+    assert (use["sent"], use["answered"], use["lost"], use["no_link"]) == (7, 4, 3, 4)
+    assert use["answered_share"] == pytest.approx(4 / 11, abs=1e-4)
+    over = use["overruns"]
+    assert (over["requests"], over["above_capacity"]) == (7, 3)
+    assert (over["p50"], over["p90"], over["p99"]) == (1.0, 7.0, 7.0)
+    assert (over["low"], over["high"]) == pytest.approx(wilson_interval(3, 7), abs=1e-6)
+    assert use["payload_overruns"]["above_capacity"] == 2
+    (ideal,) = summarise([made_up_row()])["aggregate"]
+    assert ideal["link_use"] is None
+
+
+def test_a_link_that_sent_nothing_has_no_shares() -> None:
+    (line,) = summarise([made_up_row(k=None, link=LINK, overruns=())])["aggregate"]
+    assert line["link_use"]["overruns"]["share"] is None
+    assert line["link_use"]["overruns"]["p90"] is None
+    assert line["link_use"]["answered_share"] == 0.0
 
 
 def test_a_wrong_instruction_counts_both_tasks() -> None:

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from comvla.number_arguments import whole
 from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.link_options import add_link_options, links_of, listed
+from comvla_sim.experiments.progress import cores, episode_bar, typed_command
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from comvla_sim.experiments.plan import EvalSettings
     from comvla_sim.experiments.runner import Subject
-    from comvla_sim.worlds.base import Task
 
 DESCRIPTION = """\
 Runs a policy in closed loop: every method at every K on the same layouts, which training never saw.
@@ -42,6 +39,7 @@ examples:
   comvla-sim eval --method hard_voting --k 16 --condition blind,wrong_instruction --json
   comvla-sim eval --method full,hard_voting,jpeg-75,h264-28 --k 32
   comvla-sim eval --method hard_voting --k 32 --target robot-cloud:50051
+  comvla-sim eval --method hard_voting --channel rician --mean-snr-db 0,10 --enforce none,prefix
 """
 
 
@@ -56,6 +54,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog=f"methods:\n{table()}\n{OWN}\n{EPILOG}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    names = listed(str)
     parser.add_argument(
         "--world", default="tabletop", help="tabletop, metaworld:TASK or libero:SUITE (tabletop)"
     )
@@ -63,20 +62,25 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--model", default="mini", help="mini, random, or a checkpoint folder (mini)"
     )
     parser.add_argument(
-        "--method", type=_names, default="full,hard_voting", help="a,b,... of those below"
+        "--method", type=names, default="full,hard_voting", help="a,b,... of those below"
     )
-    parser.add_argument("--k", type=_numbers, default="32", help="tokens sent: 64,32,... (32)")
-    parser.add_argument("--condition", type=_names, default="normal", help="see below (normal)")
+    parser.add_argument(
+        "--k",
+        type=listed(_tokens),
+        help='tokens sent: 64,32,... ; "link" for what the link carries (32; link with --channel)',
+    )
+    parser.add_argument("--condition", type=names, default="normal", help="see below (normal)")
     parser.add_argument("--episodes", type=whole(), default=20, help="layouts per instruction (20)")
     parser.add_argument("--seed", type=whole(), default=0, help="chooses the layouts (0)")
     parser.add_argument(
-        "--instructions", type=_names, help="names or sentences of tasks, a,b,... (all)"
+        "--instructions", type=names, help="names or sentences of tasks, a,b,... (all)"
     )
     parser.add_argument("--quantization", default="int8", help="of the tokens on the wire (int8)")
     parser.add_argument("--workers", type=whole(), default=0, help="processes (one per core)")
     parser.add_argument("--target", metavar="HOST:PORT", help="a running server; else in process")
     parser.add_argument("--out", type=Path, help="results file (a name in runs/eval)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_link_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -102,12 +106,14 @@ def run(args: argparse.Namespace) -> int:
         target=args.target,
     )
     subject = runner.inspect(settings)
+    links = links_of(args, subject.token_dim)
     grid = plan.Grid(
         conditions=args.condition,
         methods=args.method,
-        ks=args.k,
-        tasks=_chosen_tasks(args.instructions, subject.tasks),
+        ks=args.k if args.k is not None else (32,) if links == (None,) else (None,),
+        tasks=plan.chosen_tasks(args.instructions, subject.tasks),
         episodes=args.episodes,
+        links=links,
     )
     grid.check(num_tokens=subject.num_tokens, seed=args.seed)
     _check_server_options(args.method, args.target)
@@ -117,14 +123,14 @@ def run(args: argparse.Namespace) -> int:
         done = sum(spec in results.rows for spec in specs)
         print(f"{path}: {done} of {len(specs)} episodes are there", file=sys.stderr)
         try:
-            with _bar(len(specs), done) as on_row:
+            with episode_bar(len(specs), done) as on_row:
                 runner.run(
                     settings,
                     specs,
                     results,
                     shared=subject.settings,
-                    story=runner.environment(settings, _command()),
-                    workers=args.workers or _cores(),
+                    story=runner.environment(settings, typed_command()),
+                    workers=args.workers or cores(),
                     on_row=on_row,
                 )
         except KeyboardInterrupt:
@@ -158,31 +164,8 @@ def _check_server_options(methods: Sequence[str], target: str | None) -> None:
             )
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(dict.fromkeys(int(name) for name in _names(text)))
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"expected whole numbers such as 64,32,16, got {text!r}"
-        ) from None
-
-
-def _chosen_tasks(wanted: Sequence[str] | None, tasks: Sequence[Task]) -> tuple[str, ...]:
-    """Names of the tasks that were asked for by name or by instruction; all where nobody asked."""
-    if not wanted:
-        return tuple(task.name for task in tasks)
-    known = {name: task.name for task in tasks for name in (task.name, task.instruction)}
-    for name in wanted:
-        if name not in known:
-            raise EvaluationError(
-                f"--instructions {name!r} is unknown: choose among "
-                f"{', '.join(task.name for task in tasks)}"
-            )
-    return tuple(dict.fromkeys(known[name] for name in wanted))
+def _tokens(text: str) -> int | None:
+    return None if text == "link" else whole()(text)
 
 
 def _default_path(settings: EvalSettings, subject: Subject) -> Path:
@@ -191,58 +174,3 @@ def _default_path(settings: EvalSettings, subject: Subject) -> Path:
     model = f"{subject.settings['model']}-{subject.settings['model_fingerprint'][:8]}"
     name = f"{world}-{model}-{settings.quantization}-seed{settings.seed}.jsonl"
     return Path("runs") / "eval" / name
-
-
-def _cores() -> int:
-    """Cores that this process may use, which in a container are fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _command() -> str:
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
-
-
-@contextmanager
-def _bar(total: int, done: int) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A progress bar on a terminal, a line every hundred episodes elsewhere; on stderr."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        count = done
-
-        def line(row: dict[str, Any]) -> None:
-            nonlocal count
-            count += 1
-            if count % 100 == 0 or count == total:
-                print(f"{count}/{total} episodes", file=sys.stderr, flush=True)
-
-        yield line
-        return
-    columns = (
-        TextColumn("episodes"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[last]}"),
-    )
-    with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("", total=total, completed=done, last="")
-
-        def show(row: dict[str, Any]) -> None:
-            outcome = "success" if row["success"] else "failure"
-            last = f"{row['condition']} {row['method']} K={row['k']} {row['task']}: {outcome}"
-            progress.update(bar, advance=1, last=last)
-
-        yield show

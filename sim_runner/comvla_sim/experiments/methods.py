@@ -133,8 +133,10 @@ def order(name: str) -> tuple[int, str]:
     return (known.index(place) if place in known else len(known)), name
 
 
-def shown_k(name: str, k: int) -> str:
+def shown_k(name: str, k: int | None) -> str:
     """K as a table shows it: a dash where it means nothing, because the method decides itself what it sends."""
+    if k is None:
+        return "link"
     if sends_pictures(name):
         return "–"
     # Nothing of anybody else's is imported to print a table.

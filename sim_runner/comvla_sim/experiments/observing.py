@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,11 +25,19 @@ class ObservedEdge:
         edge: the model.
         heard: an instruction that selects the tokens, whatever the client asks for; None selects by
             the client's own.
+        look: pictures of this moment, taken when they are encoded, instead of those that the client
+            has. Drawing is most of an episode's cost, and a robot that sends nothing needs none.
     """
 
-    def __init__(self, edge: EdgeModel, heard: str | None = None) -> None:
+    def __init__(
+        self,
+        edge: EdgeModel,
+        heard: str | None = None,
+        look: Callable[[], Sequence[npt.NDArray[np.uint8]]] | None = None,
+    ) -> None:
         self._edge = edge
         self._heard = heard
+        self._look = look
         self.tokens: Any = None
         self.projected: Any = None
         self.queries: Any = None
@@ -55,6 +63,8 @@ class ObservedEdge:
         """Visual tokens (N, D)."""
         self.projected = None
         edge: Any = self._edge
+        if self._look is not None:
+            images = self._look()
         self.tokens = (
             edge.encode(images, instruction) if self.sees_instruction else edge.encode(images)
         )

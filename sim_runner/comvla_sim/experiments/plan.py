@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 from comvla.errors import ComVLAError
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout
+from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.methods import find_method
+
+if TYPE_CHECKING:
+    from comvla_sim.worlds.base import Task
 
 CONDITIONS = ("normal", "blind", "wrong_instruction", "wrong_selection")
 """How an episode is run: as it should be, or with one thing wrong (:mod:`.rollout`)."""
@@ -37,23 +42,42 @@ class EvalSettings:
     target: str | None = None
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class EpisodeSpec:
     """One episode. Equal specs under equal settings give equal results.
 
     Attributes:
         condition: one of :data:`CONDITIONS`.
         method: name of a method (:mod:`.methods`).
-        k: tokens sent; N for methods that decide themselves what they send.
+        k: tokens sent; N for methods that decide themselves what they send; None for as many as the
+            link carries.
         task: name of the world's task.
         episode: number that chooses the layout.
+        link: that the episode runs over; None loses nothing and takes no time.
     """
 
     condition: str
     method: str
-    k: int
+    k: int | None
     task: str
     episode: int
+    link: LinkCase | None = None
+
+    def to_row(self) -> dict[str, Any]:
+        """Plain JSON values, as they stand in a row of results."""
+        return {**vars(self), "link": None if self.link is None else self.link.to_dict()}
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> EpisodeSpec:
+        """The episode that a row reports.
+
+        Raises:
+            KeyError, TypeError: the row says too little.
+        """
+        named = {field.name: row[field.name] for field in fields(cls)}
+        if named["link"] is not None:
+            named["link"] = LinkCase.from_dict(named["link"])
+        return cls(**named)
 
 
 @dataclass(frozen=True)
@@ -63,16 +87,19 @@ class Grid:
     Attributes:
         conditions: see :data:`CONDITIONS`.
         methods: names of methods.
-        ks: numbers of tokens; a method that decides itself what it sends runs once, not once for each.
+        ks: numbers of tokens, None for what the link carries; a method that decides itself what it
+            sends runs once, not once for each.
         tasks: names of tasks.
         episodes: layouts for each task.
+        links: that every episode is run over; None is the ideal one.
     """
 
     conditions: tuple[str, ...]
     methods: tuple[str, ...]
-    ks: tuple[int, ...]
+    ks: tuple[int | None, ...]
     tasks: tuple[str, ...]
     episodes: int
+    links: tuple[LinkCase | None, ...] = (None,)
 
     def check(self, *, num_tokens: int, seed: int) -> None:
         """Refuses a grid that cannot be run.
@@ -93,7 +120,9 @@ class Grid:
         if not all(find_method(method).decides_itself for method in self.methods) and not self.ks:
             raise EvaluationError("--k is empty: give numbers of tokens such as 512,64,32,16")
         for k in self.ks:
-            if not 1 <= k <= num_tokens:
+            if k is None and None in self.links:
+                raise EvaluationError("--k link needs a link that limits it: choose a --channel")
+            if k is not None and not 1 <= k <= num_tokens:
                 raise EvaluationError(f"--k must be from 1 to the model's {num_tokens}, got {k}")
         if not any(True for _ in self.specs(num_tokens)):
             raise EvaluationError(
@@ -111,20 +140,20 @@ class Grid:
                 raise EvaluationError(f"--method {name}: {error}") from error
             except ValueError as error:
                 raise EvaluationError(f"--method {name}: {error}") from error
-            if getattr(form, "adjustable", False):
+            if getattr(form, "adjustable", False) and None in self.links:
                 raise EvaluationError(
                     f"--method {name}: the link decides its quality, and an ideal link decides nothing: "
-                    f"name one, such as {name}-75"
+                    f"name one, such as {name}-75, or a --channel"
                 )
 
     def specs(self, num_tokens: int) -> Iterator[EpisodeSpec]:
         """All episodes, layout by layout, so that whatever is there already can be compared."""
-        for episode, task in itertools.product(range(self.episodes), self.tasks):
+        for episode, task, link in itertools.product(range(self.episodes), self.tasks, self.links):
             for condition, method in itertools.product(self.conditions, self.methods):
                 if condition == "wrong_selection" and not find_method(method).listens:
                     continue  # what does not listen cannot be misled
                 for k in (num_tokens,) if find_method(method).decides_itself else self.ks:
-                    yield EpisodeSpec(condition, method, k, task, episode)
+                    yield EpisodeSpec(condition, method, k, task, episode, link)
 
 
 def _known(option: str, names: Sequence[str], known: Sequence[str]) -> None:
@@ -133,3 +162,21 @@ def _known(option: str, names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             raise EvaluationError(f"{option} {name!r} is unknown: choose among {', '.join(known)}")
+
+
+def chosen_tasks(wanted: Sequence[str] | None, tasks: Sequence[Task]) -> tuple[str, ...]:
+    """Names of the tasks that were asked for by name or by instruction; all where nobody asked.
+
+    Raises:
+        EvaluationError: an unknown one.
+    """
+    if not wanted:
+        return tuple(task.name for task in tasks)
+    known = {name: task.name for task in tasks for name in (task.name, task.instruction)}
+    for name in wanted:
+        if name not in known:
+            raise EvaluationError(
+                f"--instructions {name!r} is unknown: choose among "
+                f"{', '.join(task.name for task in tasks)}"
+            )
+    return tuple(dict.fromkeys(known[name] for name in wanted))

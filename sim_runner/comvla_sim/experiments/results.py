@@ -16,20 +16,29 @@ try:
 except ImportError:  # a system without file locks
     fcntl = None  # type: ignore[assignment]
 
-FORMAT = 1
+FORMAT = 2
+"""Format 1 knew the ideal link only; its rows are read as such."""
 
 Row = dict[str, Any]
 
+spec_of = EpisodeSpec.from_row
 
-def spec_of(row: Mapping[str, Any]) -> EpisodeSpec:
-    """The episode that a row reports."""
-    return EpisodeSpec(
-        condition=row["condition"],
-        method=row["method"],
-        k=row["k"],
-        task=row["task"],
-        episode=row["episode"],
-    )
+
+def _current(row: Row) -> Row:
+    """A row of an older format as this version would have written it."""
+    if row.get("format") != 1:
+        return row
+    settings = {key: value for key, value in row["settings"].items() if key != "link"}
+    unknown = dict.fromkeys(("link", "channel_seed", "link_use"))
+    return {**row, **unknown, "format": FORMAT, "settings": settings}
+
+
+def _require_format(row: Row, where: str) -> None:
+    if row.get("format") != FORMAT:
+        raise EvaluationError(
+            f"{where} has format {row.get('format')!r}, this version reads 1 and {FORMAT}: use the "
+            "version of comvla that wrote it, or run the evaluation again"
+        )
 
 
 def key_of(row: Mapping[str, Any]) -> tuple[str, EpisodeSpec]:
@@ -55,18 +64,16 @@ def read_rows(path: Path) -> tuple[list[Row], int]:
     complete = content.rfind(b"\n") + 1
     for number, line in enumerate(content[:complete].splitlines(), start=1):
         try:
-            row = json.loads(line)
+            row = _current(json.loads(line))
+            _require_format(row, f"{path}, line {number}")
             key = key_of(row)
-        except (ValueError, KeyError, TypeError) as error:
+        except EvaluationError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise EvaluationError(
                 f"{path}, line {number} is no result of comvla-sim eval ({error!r}): "
                 "name another file"
             ) from error
-        if row.get("format") != FORMAT:
-            raise EvaluationError(
-                f"{path}, line {number} has format {row.get('format')!r}, this version reads "
-                f"{FORMAT}: run the evaluation again"
-            )
         if key not in seen:
             seen.add(key)
             rows.append(row)

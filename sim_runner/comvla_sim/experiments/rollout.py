@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from comvla_client import ComVLAClient, StepReport
 from comvla_client.edge import EdgeModel
-from comvla_client.transport import Transport
+from comvla_client.transport import GrpcTransport, Transport
+from comvla_client.uplink import UplinkForm
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout, foreign_layout
+from comvla_sim.experiments.link_case import channel_seed
 from comvla_sim.experiments.methods import find_method
 from comvla_sim.experiments.observing import ObservedEdge, SelectionStatistics
+from comvla_sim.experiments.over_link import EpisodeLink
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
+from comvla_sim.link import LinkRecord
 from comvla_sim.worlds.base import Task, World
 
 Pictures = npt.NDArray[np.uint8]
+
+OnQuery: TypeAlias = Callable[[int, StepReport, LinkRecord | None], None]
 
 # Simulated time stands still while the policy thinks; a slow machine must not change results.
 _DEADLINE_S = 600.0
@@ -108,12 +115,51 @@ class _Totals:
         self.cloud_flops += report.cloud_flops
 
 
+def _link(
+    target: Transport | str, spec: EpisodeSpec, seed: int, world: World
+) -> EpisodeLink | None:
+    if spec.link is None:
+        return None
+    transport = GrpcTransport(target) if isinstance(target, str) else target
+    return EpisodeLink(spec.link, seed, world.max_episode_steps, transport)
+
+
+def _client(
+    target: EpisodeLink | Transport | str,
+    edge: EdgeModel,
+    form: UplinkForm,
+    spec: EpisodeSpec,
+    settings: EvalSettings,
+    seed: int,
+) -> ComVLAClient:
+    # Pictures are as large as they are; a number would limit their bytes.
+    budget: Any = spec.k if form.in_pieces else "paper"
+    options: dict[str, Any] = {}
+    if isinstance(target, EpisodeLink):
+        case = target.case
+        if budget is None or find_method(spec.method).decides_itself:
+            budget = case.budget
+        options = {"link": case.profile(), "sending": target.sending()}
+        target = target.transport
+    return ComVLAClient(
+        target,
+        edge=edge,
+        uplink=form,
+        budget=budget,
+        quantization=settings.quantization,
+        deadline_s=_DEADLINE_S,
+        seed=seed,
+        **options,
+    )
+
+
 def run_episode(
     world: World,
     edge: EdgeModel,
     target: Transport | str,
     spec: EpisodeSpec,
     settings: EvalSettings,
+    on_query: OnQuery = lambda step, report, record: None,
 ) -> dict[str, Any]:
     """Runs one episode and returns what it measured, as plain JSON values.
 
@@ -128,6 +174,8 @@ def run_episode(
         target: a transport or ``host:port``.
         spec: which episode.
         settings: of the evaluation.
+        on_query: called after each query with the control period in which it was made, the
+            client's account, and the link's, where there is one and something was sent.
 
     Raises:
         EvaluationError: the condition is impossible here, or the server fell silent.
@@ -141,49 +189,68 @@ def run_episode(
         film = expert_pictures(world, spec.task, elsewhere, edge.info.action_horizon)
     observation, _ = world.reset(seed=layout_seed, options={"task": spec.task})
     roles = cast(world, spec, layout_seed)
-    observed = ObservedEdge(edge, roles.heard.instruction if roles.heard else None)
     method = find_method(spec.method)
     form = method.form()
+    observed = ObservedEdge(
+        edge,
+        roles.heard.instruction if roles.heard else None,
+        look=None if film or not form.in_pieces else lambda: list(world.observe()["images"]),
+    )
+
+    def look(query: int) -> list[Pictures]:
+        if film:
+            return list(film[min(query, len(film) - 1)])
+        if form.in_pieces:  # the edge half takes its own; these are there to be checked
+            return list(observation["images"])
+        return list(world.observe()["images"] if query else observation["images"])
+
     compared = roles.other if spec.condition == "normal" else None
     statistics = SelectionStatistics(
         observed, method.selector(), compared.instruction if compared else None, layout_seed
     )
     totals = _Totals()
-    success = other_success = False
+    link = _link(target, spec, channel_seed(layout_seed, world.tasks.index(roles.task)), world)
+    success = other_success = ended = False
     steps = 0
-    with ComVLAClient(
-        target,
-        edge=observed,
-        uplink=form,
-        budget=spec.k if form.in_pieces else "paper",
-        quantization=settings.quantization,
-        deadline_s=_DEADLINE_S,
-        seed=layout_seed,
-    ) as client:
-        while steps < world.max_episode_steps:
-            pictures = film[min(totals.queries, len(film) - 1)] if film else observation["images"]
-            shown = {"images": list(pictures), "proprio": observation["proprio"]}
-            chunk = client.step(shown, roles.spoken.instruction)
-            totals.add(chunk.report)
-            if chunk.report.fallback_reason is not None:
+    with _client(link or target, observed, form, spec, settings, layout_seed) as client:
+        while steps < world.max_episode_steps and not ended:
+            shown = {"images": look(totals.queries), "proprio": world.proprio()}
+            hold, asked = client.hold_action, 0 if link is None else link.period
+            chunk = client.step(
+                shown, roles.spoken.instruction, None if link is None else link.reading()
+            )
+            report = chunk.report
+            totals.add(report)
+            record = None if link is None else link.account(report)
+            if report.source == "cloud":
+                kept = report.positions[: report.tokens_used]
+                statistics.add(kept, None if film else world, roles.spoken)
+            elif link is None or report.fallback_reason not in ("no_link", "deadline"):
                 raise EvaluationError(
-                    f"the policy gave no answer ({chunk.report.fallback_reason}: "
-                    f"{chunk.report.detail}): check the server, then run the same command again"
+                    f"the policy gave no answer ({report.fallback_reason}: {report.detail}): check "
+                    "the server, then run the same command again"
                 )
-            statistics.add(chunk.report.positions, None if film else world, roles.spoken)
-            actions = world.from_policy(chunk.actions)
-            for action in actions[: world.max_episode_steps - steps]:
+            on_query(steps, report, record)
+            # Without an answer the robot executes the rest of the last chunk, then holds for one
+            # period and asks again, as ``act`` does. While an answer is late it holds, too.
+            actions = world.from_policy(chunk.actions)[: max(1, chunk.planned)]
+            waited = 0 if link is None else link.period - asked
+            if waited:
+                waiting = world.from_policy(np.tile(hold, (waited, 1)))
+                actions = np.concatenate([waiting, actions])
+            for number, action in enumerate(actions[: world.max_episode_steps - steps]):
                 world.advance(action)
                 steps += 1
+                if link is not None:
+                    link.use.held_periods += number < waited or not chunk.planned
+                    if number >= waited:
+                        link.advance()
                 fulfilled = world.successes()
                 success |= fulfilled[roles.task.name]
                 other_success |= roles.other is not None and fulfilled[roles.other.name]
                 ended = fulfilled[roles.spoken.name]
                 if ended:
                     break
-            if ended:
-                break
-            observation = world.observe()
     return {
         "layout_seed": layout_seed,
         "instruction": roles.task.instruction,
@@ -195,5 +262,7 @@ def run_episode(
         "steps": steps,
         **vars(totals),
         "selection": statistics.as_dict(),
+        "channel_seed": None if link is None else link.seed,
+        "link_use": None if link is None else vars(link.use),
         "wall_s": round(time.perf_counter() - started, 3),
     }

@@ -24,6 +24,7 @@ from comvla_sim.experiments.results import FORMAT, ResultsFile, Row
 if TYPE_CHECKING:
     from comvla_client.edge import EdgeModel
     from comvla_client.transport import Transport
+    from comvla_sim.experiments.rollout import OnQuery
     from comvla_sim.worlds.base import Task, World
     from comvla_vla import CloudModel
 
@@ -39,11 +40,13 @@ class Subject:
     Attributes:
         settings: ``settings`` of every row.
         num_tokens: N of the model.
+        token_dim: D of the model.
         tasks: of the world.
     """
 
     settings: dict[str, Any]
     num_tokens: int
+    token_dim: int
     tasks: tuple[Task, ...]
 
 
@@ -68,14 +71,13 @@ def inspect(settings: EvalSettings) -> Subject:
         "model": info.name,
         "model_fingerprint": info.fingerprint,
         "quantization": settings.quantization,
-        "link": "ideal",
         "versions": {
             **{name: _version(name) for name in ("comvla", "metaworld", "mujoco")},
             **elsewhere,
         },
         **labels,
     }
-    return Subject(shared, info.num_tokens, tasks)
+    return Subject(shared, info.num_tokens, info.token_dim, tasks)
 
 
 def _version(package: str) -> str:
@@ -124,12 +126,13 @@ class Worker:
         resizes = bool(getattr(self._edge, "any_image_size", False))
         self._world: World = make(settings.world, image_size=None if resizes else height)
 
-    def run(self, spec: EpisodeSpec) -> Measured:
-        """One episode."""
+    def run(self, spec: EpisodeSpec, on_query: OnQuery | None = None) -> Measured:
+        """One episode; ``on_query`` as for :func:`comvla_sim.experiments.rollout.run_episode`."""
         from comvla_sim.experiments.rollout import run_episode
 
+        heard = () if on_query is None else (on_query,)
         target = self._target(find_method(spec.method))
-        return spec, run_episode(self._world, self._edge, target, spec, self._settings)
+        return spec, run_episode(self._world, self._edge, target, spec, self._settings, *heard)
 
     def _target(self, method: Method) -> Transport | str:
         """Where a method's requests go: the user's server, or the cloud half here, run as the method needs."""
@@ -262,7 +265,7 @@ def run(
     )
     with contextlib.closing(measured):
         for spec, values in measured:
-            row: Row = {"format": FORMAT, **vars(spec), **values}
+            row: Row = {"format": FORMAT, **spec.to_row(), **values}
             row.update(settings=shared, environment=story)
             results.append(row)
             on_row(row)

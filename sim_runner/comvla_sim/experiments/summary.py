@@ -6,16 +6,19 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from typing import Any
 
+from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.methods import order
 from comvla_sim.experiments.plan import CONDITIONS, FULL
-from comvla_sim.experiments.results import Row
+from comvla_sim.experiments.results import Row, spec_of
 from comvla_sim.experiments.statistics import mcnemar, wilson_interval
 
-Entry = tuple[str, str, int]
-"""Condition, method, K."""
+_USES = ("csi_delay", "enforce", "sending", "budget", "useful_tokens")
+
+Entry = tuple[str, str, "int | None", "LinkCase | None"]
+"""Condition, method, K, link."""
 
 
 def summarise(rows: Iterable[Row]) -> dict[str, Any]:
@@ -25,13 +28,14 @@ def summarise(rows: Iterable[Row]) -> dict[str, Any]:
         rows: episodes measured under equal settings.
 
     Returns:
-        ``rows``: per condition, method, K and instruction: episodes, successes and their Wilson
-        interval. ``aggregate``: the same over all instructions, with bytes, FLOPs and selection
-        statistics. ``comparisons``: exact McNemar tests on equal episodes.
+        ``rows``: per condition, method, K, link and instruction: episodes, successes and their
+        Wilson interval. ``aggregate``: the same over all instructions, with bytes, FLOPs, what the
+        link did, and selection statistics. ``comparisons``: exact McNemar tests on equal episodes.
     """
     groups: dict[Entry, list[Row]] = defaultdict(list)
     for row in rows:
-        groups[row["condition"], row["method"], row["k"]].append(row)
+        spec = spec_of(row)
+        groups[spec.condition, spec.method, spec.k, spec.link].append(row)
     entries = sorted(groups, key=_order)
     return {
         "rows": [line for entry in entries for line in _by_instruction(entry, groups[entry])],
@@ -44,16 +48,28 @@ def summarise(rows: Iterable[Row]) -> dict[str, Any]:
     }
 
 
-def _order(entry: Entry) -> tuple[int, tuple[int, str], int]:
-    condition, method, k = entry
-    return CONDITIONS.index(condition), order(method), -k
+def _order(entry: Entry) -> tuple[Any, ...]:
+    condition, method, k, link = entry
+    case = () if link is None else (1, *astuple(link))
+    return CONDITIONS.index(condition), case, order(method), -(k or 0)
 
 
 def _comparable(first: Entry, second: Entry) -> bool:
-    """Methods at equal K and against full transmission; conditions against the normal one."""
+    """What differs in one thing: method, K against full transmission, condition, use of the link."""
+    if first[3] != second[3]:
+        return first[:3] == second[:3] and _one_use_differs(first[3], second[3])
     if first[0] == second[0]:
         return first[2] == second[2] or FULL in (first[1], second[1])
     return "normal" in (first[0], second[0]) and first[1:] == second[1:]
+
+
+def _one_use_differs(first: LinkCase | None, second: LinkCase | None) -> bool:
+    """Two ways of using one link, not two links."""
+    if first is None or second is None:
+        return False
+    a, b = first.to_dict(), second.to_dict()
+    different = [key for key in a if a[key] != b[key]]
+    return len(different) == 1 and different[0] in _USES
 
 
 def _counts(rows: Sequence[Row], key: str = "success") -> dict[str, Any]:
@@ -75,7 +91,9 @@ def _other_counts(rows: Sequence[Row]) -> dict[str, Any] | None:
 
 
 def _named(entry: Entry) -> dict[str, Any]:
-    return dict(zip(("condition", "method", "k"), entry, strict=True))
+    condition, method, k, link = entry
+    case = None if link is None else link.to_dict()
+    return {"condition": condition, "method": method, "k": k, "link": case}
 
 
 def _by_instruction(entry: Entry, rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -117,9 +135,48 @@ def _aggregate(entry: Entry, rows: Sequence[Row]) -> dict[str, Any]:
         "framed_bytes_per_query": per_query("framed_bytes"),
         "edge_flops_per_query": per_query("edge_flops"),
         "cloud_flops_per_query": per_query("cloud_flops"),
+        "link_use": link_use([row["link_use"] for row in rows if row["link_use"]]),
         "wall_s": round(sum(row["wall_s"] for row in rows), 1),
         "selection": _selection([row["selection"] for row in rows]),
     }
+
+
+def link_use(episodes: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Sums over episodes, shares of queries, and percentiles of the overruns; None without any.
+
+    Args:
+        episodes: ``link_use`` of rows.
+    """
+    if not episodes:
+        return None
+    lists = ("overruns", "payload_overruns")
+    total = {key: sum(e[key] for e in episodes) for key in episodes[0] if key not in lists}
+    queries = total["sent"] + total["no_link"]
+    use: dict[str, Any] = {**total, "answered_share": _share(total["answered"], queries)}
+    for key in lists:
+        ratios = sorted(ratio for e in episodes for ratio in e[key])
+        above = sum(ratio > 1 for ratio in ratios)
+        low, high = wilson_interval(above, len(ratios))
+        use[key] = {
+            "requests": len(ratios),
+            "above_capacity": above,
+            "share": _share(above, len(ratios)),
+            "low": round(low, 6),
+            "high": round(high, 6),
+            **{f"p{p}": _percentile(ratios, p) for p in (50, 90, 99)},
+        }
+    return use
+
+
+def _share(part: int, whole: int) -> float | None:
+    return round(part / whole, 4) if whole else None
+
+
+def _percentile(ordered: Sequence[float], percent: int) -> float | None:
+    """The smallest value that at least so many percent do not exceed."""
+    if not ordered:
+        return None
+    return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
 
 
 def _selection(episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:

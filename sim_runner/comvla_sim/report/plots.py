@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from comvla_sim.experiments.plan import FULL
+from comvla_sim.report.terminal import method_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 # Okabe and Ito: told apart with every kind of colour vision, in print too.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = "osD^vP"
+
+STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "comvla", "font.size": 10}
+"""Text stays text, and equal results give equal files."""
 
 
 def success_against_tokens(lines: Sequence[dict[str, Any]], *, title: str = "") -> bytes:
@@ -23,7 +27,8 @@ def success_against_tokens(lines: Sequence[dict[str, Any]], *, title: str = "") 
         lines: ``aggregate`` of :func:`comvla_sim.experiments.summary.summarise`.
         title: above the plot.
     """
-    return _plot(lines, lambda line: float(line["k"]), "tokens sent, K", title)
+    chosen = [line for line in lines if line["k"] is not None]
+    return _plot(chosen, lambda line: float(line["k"]), "tokens sent, K", title)
 
 
 def success_against_bytes(lines: Sequence[dict[str, Any]], *, title: str = "") -> bytes:
@@ -45,9 +50,7 @@ def _plot(
     import matplotlib
     from matplotlib.figure import Figure
 
-    # Text stays text, and equal results give equal files.
-    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "comvla", "font.size": 10}
-    with matplotlib.rc_context(settings):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 4.0), layout="constrained")
         axes = figure.subplots()
         _draw(axes, lines, x_of)
@@ -68,11 +71,11 @@ def _draw(
     from matplotlib.ticker import FuncFormatter
 
     drawn = [line for line in lines if line["condition"] in ("normal", "wrong_selection")]
-    series = dict.fromkeys((line["condition"], line["method"]) for line in drawn)
+    series = dict.fromkeys((x["condition"], x["method"], method_name(x)) for x in drawn)
     axes.set_xscale("log", base=2)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    for number, (condition, method) in enumerate(series):
-        points = [x for x in drawn if (x["condition"], x["method"]) == (condition, method)]
+    for number, (condition, method, name) in enumerate(series):
+        points = [x for x in drawn if (x["condition"], method_name(x)) == (condition, name)]
         points.sort(key=x_of)
         rates = [100 * point["success_rate"] for point in points]
         below = [rate - 100 * point["low"] for rate, point in zip(rates, points, strict=True)]
@@ -83,7 +86,7 @@ def _draw(
             rates,
             # Rounded bounds may pass the rate itself by a hair, and bars have no negative length.
             yerr=([max(0.0, b) for b in below], [max(0.0, a) for a in above]),
-            label=method if condition == "normal" else f"{condition}: {method}",
+            label=name if condition == "normal" else f"{condition}: {name}",
             color=colour,
             marker=MARKERS[number % len(MARKERS)],
             linestyle="-" if condition == "normal" else "--",

@@ -8,9 +8,10 @@ from html import escape
 from typing import Any
 
 from comvla_sim.experiments.methods import shown_k
-from comvla_sim.report.terminal import entry_name, percent
+from comvla_sim.report.terminal import entry_name, method_name, percent
 
 _OWN = "its own size"
+_LINK = "K = link"
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,10 @@ def all_tables(summary: dict[str, Any]) -> list[Table]:
 
 
 def _success_by_k(lines: Sequence[dict[str, Any]]) -> Table:
-    ks = sorted({line["k"] for line in lines if _has_k(line)}, reverse=True)
-    heads = [f"K = {k}" for k in ks]
-    own = any(not _has_k(line) for line in lines)
-    cells = {
-        (_series(line), f"K = {line['k']}" if _has_k(line) else _OWN): rate_with_interval(line)
-        for line in lines
-    }
+    found = {_head(line): line["k"] for line in lines}
+    ks = sorted((k for head, k in found.items() if head not in (_LINK, _OWN)), reverse=True)
+    heads = [*(f"K = {k}" for k in ks), *(head for head in (_LINK, _OWN) if head in found)]
+    cells = {(_series(line), _head(line)): rate_with_interval(line) for line in lines}
     names = dict.fromkeys(_series(line) for line in lines)
     counts = sorted({line["episodes"] for line in lines})
     episodes = " to ".join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))
@@ -91,20 +89,18 @@ def _success_by_k(lines: Sequence[dict[str, Any]]) -> Table:
         "Success by number of tokens",
         f"Percent of episodes over all instructions with 95 % Wilson intervals; {episodes} episodes "
         "per cell, the same layouts everywhere.",
-        ("method", *heads, *([_OWN] if own else [])),
-        tuple(
-            (name, *(cells.get((name, head), "–") for head in (*heads, *([_OWN] if own else []))))
-            for name in names
-        ),
+        ("method", *heads),
+        tuple((name, *(cells.get((name, head), "–") for head in heads)) for name in names),
     )
 
 
-def _has_k(line: dict[str, Any]) -> bool:
-    return shown_k(line["method"], line["k"]).isdigit()
+def _head(line: dict[str, Any]) -> str:
+    k = shown_k(line["method"], line["k"])
+    return f"K = {k}" if k.isdigit() or line["k"] is None else _OWN
 
 
 def _series(line: dict[str, Any]) -> str:
-    method = str(line["method"])
+    method = method_name(line)
     return method if line["condition"] == "normal" else f"{line['condition']}: {method}"
 
 

@@ -9,6 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.methods import shown_k
 
 _MAX_COMPARISONS = 12
@@ -25,7 +26,15 @@ def entry_name(entry: Line) -> str:
     """Condition, method and K in a few words; the normal condition goes without saying."""
     k = "" if entry["method"] == "full" else shown_k(entry["method"], entry["k"])
     method = f"{entry['method']} {k}" if k.isdigit() else entry["method"]
+    if entry.get("link"):
+        method = f"{method} over {LinkCase.from_dict(entry['link']).label}"
     return method if entry["condition"] == "normal" else f"{entry['condition']}: {method}"
+
+
+def method_name(line: Line) -> str:
+    """Method and link in a few words."""
+    link = line.get("link")
+    return line["method"] if not link else f"{line['method']} over {LinkCase.from_dict(link).label}"
 
 
 def print_summary(summary: dict[str, Any], console: Console | None = None) -> None:
@@ -69,7 +78,7 @@ def _over_all_tasks(lines: Sequence[Line]) -> Table:
         other, selection = line["other"], line["selection"]
         votes = selection["distinct_votes"]
         cells = [
-            line["method"],
+            method_name(line),
             shown_k(line["method"], line["k"]),
             f"{line['successes']}/{line['episodes']}",
             percent(line["success_rate"]),
@@ -90,7 +99,7 @@ def _print_by_task(condition: str, lines: Sequence[Line], console: Console) -> N
     equal = len(counts) == 1
     title = f"{condition}: successes by task" + (f", of {min(counts)}" if equal else "")
     cells = {
-        (line["method"], line["k"], line["task"]): str(line["successes"])
+        (method_name(line), line["k"], line["task"]): str(line["successes"])
         if equal
         else f"{line['successes']}/{line['episodes']}"
         for line in lines
@@ -98,9 +107,9 @@ def _print_by_task(condition: str, lines: Sequence[Line], console: Console) -> N
     # Names such as drawer-open over two lines: eight of them fit on a terminal.
     heads = ["K", *(task.replace("-", "\n") for task in tasks)]
     table = _table(["method"], heads)
-    for method, k in dict.fromkeys((line["method"], line["k"]) for line in lines):
-        row = (cells.get((method, k, task), "–") for task in tasks)
-        table.add_row(method, shown_k(method, k), *row)
+    for name, k, method in dict.fromkeys((method_name(x), x["k"], x["method"]) for x in lines):
+        row = (cells.get((name, k, task), "–") for task in tasks)
+        table.add_row(name, shown_k(method, k), *row)
     console.print(title, style="bold")
     console.print(table)
 

@@ -274,6 +274,10 @@ class World(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         black = np.zeros((NUM_VIEWS, self.image_size, self.image_size, 3), np.uint8)
         return {"images": black, "proprio": self._proprio()}
 
+    def proprio(self) -> npt.NDArray[np.float32]:
+        """The proprioception (P,) of the present state, without a picture of it."""
+        return self._proprio()
+
     def from_policy(self, actions: npt.ArrayLike) -> npt.NDArray[Any]:
         """Actions (..., A) as a policy of this world says them, in this world's own convention."""
         return np.asarray(actions)

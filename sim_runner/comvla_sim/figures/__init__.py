@@ -1,0 +1,1 @@
+"""Figures that are measured where they are drawn: what is missing is run first, then plotted."""

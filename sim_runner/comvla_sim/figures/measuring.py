@@ -1,0 +1,117 @@
+"""Runs the episodes of a figure that no earlier run has left behind."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from comvla_sim.experiments import runner
+from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.layouts import evaluation_layout
+from comvla_sim.experiments.link_case import LinkCase
+from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
+from comvla_sim.experiments.progress import cores, episode_bar, typed_command
+from comvla_sim.experiments.results import ResultsFile, Row, read_rows
+from comvla_sim.figures.series import Series
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a figure is measured on.
+
+    Attributes:
+        settings: of the evaluation.
+        subject: the model and the world.
+        tasks: names of tasks.
+        episodes: layouts for each task.
+        out: folder of results and pictures.
+        workers: processes; 0 for one per core.
+    """
+
+    settings: EvalSettings
+    subject: runner.Subject
+    tasks: tuple[str, ...]
+    episodes: int
+    out: Path
+    workers: int
+
+    def check(self) -> None:
+        """Refuses what cannot be run.
+
+        Raises:
+            EvaluationError: names what is wrong.
+        """
+        if self.workers < 0:
+            raise EvaluationError(f"--workers must be 0 (one per core) or more, got {self.workers}")
+        if self.episodes < 1:
+            raise EvaluationError(f"--episodes must be at least 1, got {self.episodes}")
+        evaluation_layout(self.settings.seed, self.episodes - 1)
+
+
+def specs(
+    study: Study, series: Mapping[str, Series], links: Sequence[LinkCase]
+) -> list[EpisodeSpec]:
+    """Every episode of every line over every link, layout by layout, each once."""
+    count = study.subject.num_tokens
+    return list(
+        dict.fromkeys(
+            line.spec(link, task, episode, count)
+            for episode in range(study.episodes)
+            for task in study.tasks
+            for link in links
+            for line in series.values()
+        )
+    )
+
+
+def measure(name: str, study: Study, wanted: Sequence[EpisodeSpec]) -> dict[EpisodeSpec, Row]:
+    """The rows of all episodes; those that another figure in the same folder has are taken over.
+
+    Args:
+        name: of the figure, and of its results file.
+        study: what is measured on.
+        wanted: episodes.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, with everything measured so far in the file.
+        ComVLAError: whatever an episode raised.
+    """
+    study.check()
+    shared = study.subject.settings
+    path = study.out / f"{name}.jsonl"
+    with ResultsFile(path, shared) as results:
+        _take_over(path, wanted, results, shared)
+        done = sum(spec in results.rows for spec in wanted)
+        print(f"{path}: {done} of {len(wanted)} episodes are there", file=sys.stderr)
+        try:
+            with episode_bar(len(wanted), done) as on_row:
+                runner.run(
+                    study.settings,
+                    wanted,
+                    results,
+                    shared=shared,
+                    story=runner.environment(study.settings, typed_command()),
+                    workers=study.workers or cores(),
+                    on_row=on_row,
+                )
+        except KeyboardInterrupt:
+            print(f"\nstopped; the same command goes on from {path}", file=sys.stderr)
+            raise
+        return {spec: results.rows[spec] for spec in wanted}
+
+
+def _take_over(
+    path: Path, wanted: Sequence[EpisodeSpec], results: ResultsFile, shared: Mapping[str, Any]
+) -> None:
+    missing = {spec for spec in wanted if spec not in results.rows}
+    for other in sorted(path.parent.glob("*.jsonl")):
+        if other == path or not missing:
+            continue
+        for row in read_rows(other)[0]:
+            spec = EpisodeSpec.from_row(row)
+            if row["settings"] == shared and spec in missing:
+                results.append(row)
+                missing.discard(spec)
