@@ -93,6 +93,22 @@ def link_of(arguments: argparse.Namespace) -> LinkSettings:
     )
 
 
+def as_list(arguments: argparse.Namespace) -> list[str]:
+    """The arguments of :func:`add_channel` and :func:`add_link` as another process takes them."""
+    parser = argparse.ArgumentParser()
+    add_channel(parser)
+    add_link(parser)
+    words: list[str] = []
+    for name, default in vars(parser.parse_args([])).items():
+        value = getattr(arguments, name)
+        option = "--" + name.replace("_", "-")
+        if name == "sysctl":
+            words += [f"{option}={setting}={to}" for setting, to in value]
+        elif value != default:
+            words.append(f"{option}={value}")
+    return words
+
+
 def _sysctl(text: str) -> tuple[str, str]:
     name, _, value = text.partition("=")
     name = name.removeprefix("net.ipv4.")

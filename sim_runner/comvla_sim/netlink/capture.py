@@ -22,7 +22,7 @@ from comvla.errors import LinkError
 from comvla_sim.bench.processes import announce, connected
 from comvla_sim.netlink.http2 import Call, CallReader
 from comvla_sim.netlink.namespaces import enter
-from comvla_sim.netlink.realtime import prefer_this_thread
+from comvla_sim.netlink.realtime import prefer_this_thread, settle
 from comvla_sim.netlink.wires import ETHERNET_HEADER_BYTES, Side
 
 _ETH_P_ALL, _ETH_P_IP = 0x0003, 0x0800
@@ -137,6 +137,7 @@ def serve(lifeline: Connection, side: Side) -> None:
     tap.bind((side.device, _ETH_P_ALL))
     tap.setblocking(False)
     reader = PacketReader()
+    settle()
     with selectors.DefaultSelector() as selector:
         selector.register(tap, selectors.EVENT_READ)
         selector.register(lifeline.fileno(), selectors.EVENT_READ, lifeline)

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from comvla_sim.bench.processes import announce, serving, wait_for_end
 from comvla_sim.demo.server_process import ServerProcess
 from comvla_sim.netlink.namespaces import enter
-from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread
+from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread, settle
 from comvla_sim.netlink.wires import CLOUD_ADDRESS
 
 SYNTHETIC = "synthetic"
@@ -63,6 +63,7 @@ def _serve_synthetic(lifeline: Connection, namespace: str, realtime: bool) -> No
     # The only one who reaches this address is the robot of this link.
     settings = ServerSettings(host=CLOUD_ADDRESS, insecure=True)
     with BackgroundServer(Engine(SyntheticCloud()), settings) as server:
+        settle()
         announce(lifeline, server.target)
         wait_for_end(lifeline)
 

@@ -134,12 +134,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _up(args: argparse.Namespace) -> int:
     from comvla_sim.netlink import keeper
-    from comvla_sim.netlink.arguments import channel_of, link_of
+    from comvla_sim.netlink.arguments import as_list, channel_of, link_of
     from comvla_sim.netlink.namespaces import check_privileges
 
     check_privileges()
     link_of(args), channel_of(args)  # a mistake is told here, not by the keeper
-    up = keeper.start(sys.argv[sys.argv.index("up") + 1 :])
+    up = keeper.start(as_list(args))
     if args.json:
         print(json.dumps(up))
         return 0

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from comvla.errors import LinkError
 from comvla_client import LinkProfile
 from comvla_sim.bench.processes import announce
-from comvla_sim.netlink.realtime import prefer_this_thread, wait_until
+from comvla_sim.netlink.realtime import prefer_this_thread, settle, wait_until
 from comvla_sim.netlink.shaper import Shaper
 from comvla_sim.netlink.wires import Side
 
@@ -43,6 +43,7 @@ def serve(
     with Shaper(side, mtu_bytes=mtu_bytes, period_s=link.period_s) as shaper:
         capacities_bytes = (link.capacity_bits(snr_db) / 8.0 for snr_db in channel)
         shaper.set_capacity(next(capacities_bytes))
+        settle()
         prefer_this_thread()
         announce(lifeline, "driver")
         try:

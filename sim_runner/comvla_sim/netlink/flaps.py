@@ -24,7 +24,7 @@ from comvla_sim.bench.processes import announce, connected
 from comvla_sim.netlink.cloud import SYNTHETIC, cloud_server
 from comvla_sim.netlink.link import LinkSettings, NamespaceLink
 from comvla_sim.netlink.namespaces import enter
-from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread, wait_until
+from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread, settle, wait_until
 from comvla_sim.netlink.synthetic import INSTRUCTION, SyntheticEdge, observation
 
 ALLOWED_PERIODS = 2.0
@@ -178,6 +178,7 @@ def _serve_robot(
         deadline_s=parameters.deadline_s,
         execute=1,
     ) as client:
+        settle()
         announce(lifeline, "robot")
         steps = list(_walk(client, lifeline, link.period_s))
         lifeline.send_bytes(json.dumps(steps).encode())

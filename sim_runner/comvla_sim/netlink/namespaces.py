@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import itertools
 import os
 import re
 import sys
@@ -24,7 +25,8 @@ NAMESPACE_FOLDER = Path("/run/netns")
 ROLES = ("robot", "air", "cloud")
 """``air`` exists only where the link has a propagation delay: the relay sits in it."""
 
-_NAME = re.compile(r"comvla-(\d+)-(\d+)-(robot|air|cloud)")
+_NAME = re.compile(r"comvla-(\d+)-(\d+)-(\d+)-(robot|air|cloud)")
+_NUMBERS = itertools.count(1)
 _CLONE_NEWNET = 0x4000_0000
 _MNT_DETACH = 2
 _MS_BIND = 4096
@@ -37,15 +39,17 @@ class LinkName:
     Attributes:
         pid: of the process that keeps the link.
         started: when that process began, in clock ticks since boot.
-        text: both, as in the names of the namespaces.
+        number: of the link among those of the process.
     """
 
     pid: int
     started: int
+    number: int
 
     @property
     def text(self) -> str:
-        return f"comvla-{self.pid}-{self.started}"
+        """All of it, as the names of the namespaces begin."""
+        return f"comvla-{self.pid}-{self.started}-{self.number}"
 
     def namespace(self, role: str) -> str:
         """Name of one of its namespaces, e.g. for ``ip netns exec``."""
@@ -58,10 +62,10 @@ class LinkName:
 
     @staticmethod
     def of_this_process() -> LinkName:
-        """The name of a link that this process keeps."""
+        """A name for another link that this process keeps."""
         started = _started(os.getpid())
         assert started is not None, "a process that asks is alive"
-        return LinkName(os.getpid(), started)
+        return LinkName(os.getpid(), started, next(_NUMBERS))
 
 
 def check_privileges() -> None:
@@ -155,7 +159,7 @@ def links() -> list[LinkName]:
     except OSError:
         return []
     found = (_NAME.fullmatch(name) for name in names)
-    return list(dict.fromkeys(LinkName(int(m[1]), int(m[2])) for m in found if m))
+    return list(dict.fromkeys(LinkName(int(m[1]), int(m[2]), int(m[3])) for m in found if m))
 
 
 def remove_leftovers() -> list[LinkName]:

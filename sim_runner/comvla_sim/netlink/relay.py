@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 
 from comvla_sim.bench.processes import announce
 from comvla_sim.netlink.namespaces import enter
-from comvla_sim.netlink.realtime import prefer_this_thread
+from comvla_sim.netlink.realtime import prefer_this_thread, settle
 
 _ETH_P_IP = 0x0800
 _BUFFER_BYTES = 64 << 20
@@ -37,6 +37,7 @@ def serve(lifeline: Connection, namespace: str, left: str, right: str, delay_s: 
         delay_s: one-way delay, seconds.
     """
     enter(namespace)
+    settle()
     prefer_this_thread()
     ports = {left: _open(left), right: _open(right)}
     other = {ports[left]: ports[right], ports[right]: ports[left]}

@@ -19,7 +19,7 @@ from comvla_client.edge import EdgeModel
 from comvla_sim.bench.processes import announce
 from comvla_sim.netlink.cloud import SYNTHETIC
 from comvla_sim.netlink.namespaces import enter
-from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread, wait_until
+from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread, settle, wait_until
 from comvla_sim.netlink.synthetic import INSTRUCTION, SyntheticEdge, observation
 
 MINI_INSTRUCTION = "push the green button"
@@ -29,6 +29,19 @@ LARGEST_RESERVE = 0.8
 SLACK_S = 0.006
 """The client winds a step up 2 ms before its deadline; the rest is for what is late on a machine."""
 
+_SKIPPED = {
+    "session": "",
+    "step": None,
+    "token_budget": 0,
+    "tokens": 0,
+    "tokens_used": 0,
+    "payload_bytes": 0,
+    "framed_bytes": 0,
+    "source": "skipped",
+    "reason": "skipped",
+    "call_s": 0.0,
+    "answered_after_s": None,
+}
 _CALIBRATING_QUERIES = 40
 _CALIBRATING_SNR_DB = 60.0
 _PROGRESS_EVERY_S = 0.5
@@ -107,6 +120,7 @@ def serve(
     ) as client:
         client.step(obs, instruction, _CALIBRATING_SNR_DB)  # a connection in use
         client.reset()
+        settle()
         announce(
             lifeline,
             json.dumps(
@@ -167,6 +181,9 @@ def _walk(
         period = query * every
         boundary = start + period * period_s
         late_s = wait_until(boundary)
+        if late_s > period_s:  # a robot that was held up skips, it does not run after the clock
+            yield {**_SKIPPED, "period": period, "boundary": boundary, "late_s": late_s}
+            continue
         # Before the first report is old enough, the robot knows the first value.
         reported = SnrReading(values[max(0, period - delay)], delay * period_s)
         chunk = client.step(obs, instruction, reported)

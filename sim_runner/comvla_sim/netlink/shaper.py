@@ -8,7 +8,7 @@ period carries less than a bucketful, that much still crosses: at most one packe
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import math
 import socket
 from contextlib import ExitStack
@@ -114,8 +114,9 @@ class Shaper:
         from pyroute2 import NetlinkError
 
         rate = max(rate, burst_bytes / _LONGEST_BURST_S)
-        if rate == self._rate:
-            return rate  # a change would only fill the bucket up
+        if rate == self._rate:  # a change would only fill the bucket up
+            self._wake()
+            return rate
         assert self._routes is not None, "a shaper works inside its with block"
         command = "add" if self._rate is None else "change"
         # The bucket's size travels as whole microseconds at this rate: never round it down to less
@@ -151,10 +152,20 @@ class Shaper:
         Linux set an alarm for the next packet by the old rate, and keeps it at a change: after a
         deep fade the queue would sleep for seconds into the good period. A packet, here one of a
         few bytes and of no protocol, wakes it.
+
+        Raises:
+            LinkError: the device is gone.
         """
         assert self._nudge is not None, "a shaper works inside its with block"
-        with contextlib.suppress(OSError):  # a device that is down has no queue to wake
+        try:
             self._nudge.send(_NUDGE)
+        except OSError as error:
+            if error.errno in (errno.ENXIO, errno.ENODEV):
+                raise LinkError(
+                    f"{self._side.device} in {self._side.namespace} has vanished: was the link taken "
+                    "down meanwhile?"
+                ) from error
+            # A device that is only down has no queue to wake.
 
     def _frame_share(self) -> float:
         return (self._mtu_bytes + ETHERNET_HEADER_BYTES) / self._mtu_bytes

@@ -1,0 +1,88 @@
+"""A connection that went silent is replaced by one that works, and one that is only late is kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import pytest
+from client_stubs import NARROW, WORDS, StubEdge, StubService, observation, serving
+from frozen_proxy import FrozenProxy
+
+from comvla_client import ComVLAClient
+from comvla_client.revival import PATIENCE_S
+
+OBS = observation()
+
+
+def client_of(target: str, **options: Any) -> ComVLAClient:
+    defaults: dict[str, Any] = {"edge": StubEdge(), "link": NARROW, "budget": 4, "execute": 1}
+    return ComVLAClient(target, **(defaults | options))
+
+
+def port_of(target: str) -> int:
+    return int(target.rpartition(":")[2])
+
+
+def test_a_step_finds_its_way_around_a_connection_that_died_before_it() -> None:
+    with (
+        serving() as (target, service),
+        FrozenProxy(port_of(target)) as proxy,
+        client_of(proxy.target, deadline_s=20.0) as client,
+    ):
+        assert client.step(OBS, WORDS).source == "cloud"
+        proxy.freeze()
+        proxy.thaw()  # what was open stays dead, what is new works
+        chunk = client.step(OBS, WORDS)
+        assert chunk.source == "cloud"
+        assert chunk.report.timings_s["total"] < 10.0
+        assert client.step(OBS, WORDS).source == "cloud"
+    assert proxy.accepted >= 2
+    assert {request.step for request in service.requests} == {0, 1, 2}
+
+
+def test_a_robot_that_holds_goes_on_as_soon_as_the_link_is_back() -> None:
+    with (
+        serving() as (target, _),
+        FrozenProxy(port_of(target)) as proxy,
+        client_of(proxy.target, deadline_s=0.1) as client,
+    ):
+        assert client.step(OBS, WORDS).source == "cloud"
+        proxy.freeze()
+        held = [client.step(OBS, WORDS) for _ in range(5)]
+        assert {chunk.source for chunk in held} == {"rest"}
+        proxy.thaw()
+        after = [client.step(OBS, WORDS) for _ in range(30)]
+    assert "cloud" in [chunk.source for chunk in after]
+    # An answer that comes late is of no use to anyone: what is executed only gets newer.
+    steps = [chunk.report.step for chunk in (*held, *after) if chunk.source == "cloud"]
+    assert steps == sorted(steps)
+
+
+def test_a_server_that_is_only_slow_is_asked_once() -> None:
+    service, release = StubService(), threading.Event()
+
+    def slow(request: Any, context: Any) -> None:
+        release.wait(6 * PATIENCE_S)
+
+    with (
+        serving(service) as (target, _),
+        FrozenProxy(port_of(target)) as proxy,
+        client_of(proxy.target, deadline_s=20.0) as client,
+    ):
+        assert client.step(OBS, WORDS).source == "cloud"
+        service.before = slow
+        assert client.step(OBS, WORDS).source == "cloud"
+    assert [request.step for request in service.requests] == [0, 1]
+
+
+@pytest.mark.alone
+def test_closing_does_not_wait_for_a_dead_connection() -> None:
+    with serving() as (target, _), FrozenProxy(port_of(target)) as proxy:
+        client = client_of(proxy.target, deadline_s=0.1)
+        proxy.freeze()
+        client.step(OBS, WORDS)
+        began = time.perf_counter()
+        client.close()
+        assert time.perf_counter() - began < 1.0
