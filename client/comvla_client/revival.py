@@ -9,8 +9,8 @@ the last ones did, or went unanswered:
 * when the ping is not answered in time, the old connection is given nothing more, and new ones are
   opened beside it, a fresh one every :data:`EVERY_S`: one whose first packet is lost waits a second;
 * whichever answers first is used: an old connection that is alive needs one round trip, a new one
-  three. A call that was under way is then made over the new one, too; the
-  server answers both alike.
+  three. A call that was under way is then made over the new one, too, if there is time; the server
+  answers both alike.
 
 All of this costs some 100 bytes for the ping and 60 for each attempt that is lost.
 """
@@ -21,7 +21,7 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import grpc
@@ -78,10 +78,14 @@ class Revival:
         self.suspected = False
 
     @property
+    def usual_s(self) -> float:
+        """What the last calls took, their median, in seconds; 0 before the first."""
+        return statistics.median(self._took_s) if self._took_s else 0.0
+
+    @property
     def patience_s(self) -> float:
         """How long a call may take before something seems to be wrong, in seconds."""
-        usual_s = statistics.median(self._took_s) if self._took_s else 0.0
-        return max(PATIENCE_S, USUAL_TIMES * usual_s)
+        return max(PATIENCE_S, USUAL_TIMES * self.usual_s)
 
     def suspect(self) -> None:
         """A call takes long, or went unanswered."""
@@ -120,9 +124,16 @@ class Revival:
         """Ends :meth:`wait`; may be called from any thread."""
         self._changed.set()
 
-    def wait(self, longest_s: float) -> None:
-        """Waits until something has changed or there is something to do."""
-        if self._old_one_lives():
+    def wait(self, longest_s: float, *, settled: bool = False) -> None:
+        """Waits until something has changed or there is something to do.
+
+        Args:
+            longest_s: seconds.
+            settled: another connection is in use or ready, so no more are opened.
+        """
+        if settled or any(spare.ready for spare in self._spares):
+            self._changed.wait(longest_s)
+        elif self._old_one_lives():
             self._drop_spares()
             self._changed.wait(longest_s)
         elif self._overdue_s() < 0.0:
@@ -177,14 +188,16 @@ class Revival:
         ping = self._ping_over(channel, wait_for_ready=True)
         self._spares.append(_Spare(channel, ping, self.wake))
         while len(self._spares) > MOST_SPARES:
-            discard(self._spares.pop(1).channel)
+            discard([self._spares.pop(1).channel])
 
     def _drop_spares(self) -> None:
+        dropped = []
         while True:
             try:  # two threads may do this at once when a client is closed
-                discard(self._spares.pop().channel)
+                dropped.append(self._spares.pop().channel)
             except IndexError:
-                return
+                break
+        discard(dropped)
 
 
 class _Spare:
@@ -210,12 +223,21 @@ def _answered(ping: Any) -> bool:
     return not (isinstance(error, grpc.RpcError) and error.code() in _NO_ANSWER)
 
 
-def discard(channel: grpc.Channel) -> threading.Thread:
-    """Closes a connection without waiting for it.
+def discard(channels: Sequence[grpc.Channel]) -> threading.Thread:
+    """Closes connections without waiting for it.
 
     gRPC's own ``close`` waits until the system has given up what a dead connection still had to
     send, for 5 seconds and more.
+
+    Returns:
+        Who closes them.
     """
-    thread = threading.Thread(target=channel.close, name="comvla-discard", daemon=True)
-    thread.start()
+
+    def close() -> None:
+        for channel in channels:
+            channel.close()
+
+    thread = threading.Thread(target=close, name="comvla-discard", daemon=True)
+    if channels:
+        thread.start()
     return thread
