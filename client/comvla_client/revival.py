@@ -46,6 +46,7 @@ MOST_SPARES = 8
 
 _LEAST_AGE_S = 0.005
 _REMEMBERED = 9
+_WORTH_STARTING = 0.7
 _PING_TIMEOUT_S = 30.0
 _NO_ANSWER = (
     grpc.StatusCode.UNAVAILABLE,
@@ -54,28 +55,15 @@ _NO_ANSWER = (
 )
 
 
-class Revival:
-    """Watches over one connection. Its methods are called from the thread that makes the calls.
+class Pace:
+    """What calls usually take, by which one is found to take long."""
 
-    Args:
-        open_channel: opens a new connection to the same server.
-        metadata: what proves who calls.
-
-    Attributes:
-        suspected: a call takes long or went unanswered, and nothing was heard since.
-    """
-
-    def __init__(
-        self, open_channel: Callable[[], grpc.Channel], metadata: Callable[[], Metadata]
-    ) -> None:
-        self._open_channel = open_channel
-        self._metadata = metadata
-        self._spares: list[_Spare] = []
-        self._ping: Any = None
-        self._pinged = 0.0
+    def __init__(self) -> None:
         self._took_s: deque[float] = deque(maxlen=_REMEMBERED)
-        self._changed = threading.Event()
-        self.suspected = False
+
+    def heard(self, took_s: float) -> None:
+        """A call was answered, after so many seconds."""
+        self._took_s.append(took_s)
 
     @property
     def usual_s(self) -> float:
@@ -87,13 +75,48 @@ class Revival:
         """How long a call may take before something seems to be wrong, in seconds."""
         return max(PATIENCE_S, USUAL_TIMES * self.usual_s)
 
+    def enough_s(self, left_s: float) -> float:
+        """How much time a call over another connection needs to be worth starting, in seconds.
+
+        With less it would not be answered, and be in the way of the next one.
+
+        Args:
+            left_s: what a call has that begins now.
+        """
+        return min(self.usual_s, _WORTH_STARTING * left_s)
+
+
+class Revival:
+    """Watches over one connection. Its methods are called from the thread that makes the calls.
+
+    Args:
+        open_channel: opens a new connection to the same server.
+        metadata: what proves who calls.
+
+    Attributes:
+        suspected: a call takes long or went unanswered, and nothing was heard since.
+        pace: what calls usually take.
+    """
+
+    def __init__(
+        self, open_channel: Callable[[], grpc.Channel], metadata: Callable[[], Metadata]
+    ) -> None:
+        self._open_channel = open_channel
+        self._metadata = metadata
+        self._spares: list[_Spare] = []
+        self._ping: Any = None
+        self._pinged = 0.0
+        self._changed = threading.Event()
+        self.pace = Pace()
+        self.suspected = False
+
     def suspect(self) -> None:
         """A call takes long, or went unanswered."""
         self.suspected = True
 
     def heard(self, took_s: float) -> None:
         """A call was answered, after so many seconds."""
-        self._took_s.append(took_s)
+        self.pace.heard(took_s)
         if self.suspected:
             self.reset()
 
@@ -155,7 +178,7 @@ class Revival:
         return None
 
     def _old_one_lives(self) -> bool:
-        return self._ping is not None and _answered(self._ping)
+        return self._ping is not None and answered(self._ping)
 
     def _overdue_s(self) -> float:
         return time.monotonic() - self._pinged - PATIENCE_S
@@ -212,10 +235,10 @@ class _Spare:
     @property
     def ready(self) -> bool:
         """Whether the server has answered."""
-        return _answered(self._ping)
+        return answered(self._ping)
 
 
-def _answered(ping: Any) -> bool:
+def answered(ping: Any) -> bool:
     """Whether a server said anything at all to a ping."""
     if not ping.done() or ping.cancelled():
         return False

@@ -28,7 +28,6 @@ Start = Callable[[Any, float, Metadata], Any]
 
 _FILLER_TIMEOUT_S = 1.0
 _CLOSE_WITHIN_S = 0.2
-_WORTH_STARTING = 0.7
 
 
 class Transport(Protocol):
@@ -225,7 +224,7 @@ class GrpcTransport:
             left_s = deadline - time.monotonic()
             call = start(self._stub(self._channel), left_s, self._access.metadata())
             try:
-                return call.result(timeout=min(left_s, self._revival.patience_s))
+                return call.result(timeout=min(left_s, self._revival.pace.patience_s))
             except grpc.FutureTimeoutError:
                 self._revival.suspect()
         return self._first_answer(call, start, deadline)
@@ -242,9 +241,7 @@ class GrpcTransport:
             grpc.FutureTimeoutError: the time is over.
         """
         current, spare, won = self._channel, None, None
-        # With less time left than this, a call over another connection would not be answered, and
-        # be in the way of the next one.
-        enough_s = min(self._revival.usual_s, _WORTH_STARTING * (deadline - time.monotonic()))
+        enough_s = self._revival.pace.enough_s(deadline - time.monotonic())
         calls: dict[grpc.Channel, Any] = {} if call is None else {current: call}
         self._revival.watch(current, calls.values())
         try:
