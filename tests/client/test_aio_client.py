@@ -110,7 +110,6 @@ async def test_the_loop_stays_free_while_the_cameras_are_encoded() -> None:
 
 
 @pytest.mark.alone
-@pytest.mark.alone
 async def test_a_server_that_never_answers() -> None:
     service = StubService()
     service.before = never_answer
