@@ -14,9 +14,6 @@ from comvla_client.locked_out import locked_out
 MAX_MESSAGE_BYTES = 16 * 2**20
 """Largest message either way: 512 float32 tokens of width 2176 are 4.3 MiB."""
 
-FRESH_CHANNEL_AFTER = 2
-"""Unanswered calls in a row after which the connection is taken for dead and made anew."""
-
 CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
     *codec.GRPC_OPTIONS,
     ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),

@@ -9,8 +9,8 @@ the last ones did, or went unanswered:
 * when the ping is not answered in time, the old connection is given nothing more, and new ones are
   opened beside it, a fresh one every :data:`EVERY_S`: one whose first packet is lost waits a second;
 * whichever answers first is used: an old connection that is alive needs one round trip, a new one
-  three. A call that was under way is then made over the new one, too; the
-  server answers both alike.
+  three. A call that was under way is then made over the new one, too, if there is time; the server
+  answers both alike.
 
 All of this costs some 100 bytes for the ping and 60 for each attempt that is lost.
 """
@@ -21,7 +21,7 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import grpc
@@ -46,12 +46,44 @@ MOST_SPARES = 8
 
 _LEAST_AGE_S = 0.005
 _REMEMBERED = 9
+_WORTH_STARTING = 0.7
 _PING_TIMEOUT_S = 30.0
 _NO_ANSWER = (
     grpc.StatusCode.UNAVAILABLE,
     grpc.StatusCode.DEADLINE_EXCEEDED,
     grpc.StatusCode.CANCELLED,
 )
+
+
+class Pace:
+    """What calls usually take, by which one is found to take long."""
+
+    def __init__(self) -> None:
+        self._took_s: deque[float] = deque(maxlen=_REMEMBERED)
+
+    def heard(self, took_s: float) -> None:
+        """A call was answered, after so many seconds."""
+        self._took_s.append(took_s)
+
+    @property
+    def usual_s(self) -> float:
+        """What the last calls took, their median, in seconds; 0 before the first."""
+        return statistics.median(self._took_s) if self._took_s else 0.0
+
+    @property
+    def patience_s(self) -> float:
+        """How long a call may take before something seems to be wrong, in seconds."""
+        return max(PATIENCE_S, USUAL_TIMES * self.usual_s)
+
+    def enough_s(self, left_s: float) -> float:
+        """How much time a call over another connection needs to be worth starting, in seconds.
+
+        With less it would not be answered, and be in the way of the next one.
+
+        Args:
+            left_s: what a call has that begins now.
+        """
+        return min(self.usual_s, _WORTH_STARTING * left_s)
 
 
 class Revival:
@@ -63,6 +95,7 @@ class Revival:
 
     Attributes:
         suspected: a call takes long or went unanswered, and nothing was heard since.
+        pace: what calls usually take.
     """
 
     def __init__(
@@ -73,15 +106,9 @@ class Revival:
         self._spares: list[_Spare] = []
         self._ping: Any = None
         self._pinged = 0.0
-        self._took_s: deque[float] = deque(maxlen=_REMEMBERED)
         self._changed = threading.Event()
+        self.pace = Pace()
         self.suspected = False
-
-    @property
-    def patience_s(self) -> float:
-        """How long a call may take before something seems to be wrong, in seconds."""
-        usual_s = statistics.median(self._took_s) if self._took_s else 0.0
-        return max(PATIENCE_S, USUAL_TIMES * usual_s)
 
     def suspect(self) -> None:
         """A call takes long, or went unanswered."""
@@ -89,7 +116,7 @@ class Revival:
 
     def heard(self, took_s: float) -> None:
         """A call was answered, after so many seconds."""
-        self._took_s.append(took_s)
+        self.pace.heard(took_s)
         if self.suspected:
             self.reset()
 
@@ -120,9 +147,16 @@ class Revival:
         """Ends :meth:`wait`; may be called from any thread."""
         self._changed.set()
 
-    def wait(self, longest_s: float) -> None:
-        """Waits until something has changed or there is something to do."""
-        if self._old_one_lives():
+    def wait(self, longest_s: float, *, settled: bool = False) -> None:
+        """Waits until something has changed or there is something to do.
+
+        Args:
+            longest_s: seconds.
+            settled: another connection is in use or ready, so no more are opened.
+        """
+        if settled or any(spare.ready for spare in self._spares):
+            self._changed.wait(longest_s)
+        elif self._old_one_lives():
             self._drop_spares()
             self._changed.wait(longest_s)
         elif self._overdue_s() < 0.0:
@@ -144,7 +178,7 @@ class Revival:
         return None
 
     def _old_one_lives(self) -> bool:
-        return self._ping is not None and _answered(self._ping)
+        return self._ping is not None and answered(self._ping)
 
     def _overdue_s(self) -> float:
         return time.monotonic() - self._pinged - PATIENCE_S
@@ -177,14 +211,16 @@ class Revival:
         ping = self._ping_over(channel, wait_for_ready=True)
         self._spares.append(_Spare(channel, ping, self.wake))
         while len(self._spares) > MOST_SPARES:
-            discard(self._spares.pop(1).channel)
+            discard([self._spares.pop(1).channel])
 
     def _drop_spares(self) -> None:
+        dropped = []
         while True:
             try:  # two threads may do this at once when a client is closed
-                discard(self._spares.pop().channel)
+                dropped.append(self._spares.pop().channel)
             except IndexError:
-                return
+                break
+        discard(dropped)
 
 
 class _Spare:
@@ -199,10 +235,10 @@ class _Spare:
     @property
     def ready(self) -> bool:
         """Whether the server has answered."""
-        return _answered(self._ping)
+        return answered(self._ping)
 
 
-def _answered(ping: Any) -> bool:
+def answered(ping: Any) -> bool:
     """Whether a server said anything at all to a ping."""
     if not ping.done() or ping.cancelled():
         return False
@@ -210,12 +246,21 @@ def _answered(ping: Any) -> bool:
     return not (isinstance(error, grpc.RpcError) and error.code() in _NO_ANSWER)
 
 
-def discard(channel: grpc.Channel) -> threading.Thread:
-    """Closes a connection without waiting for it.
+def discard(channels: Sequence[grpc.Channel]) -> threading.Thread:
+    """Closes connections without waiting for it.
 
     gRPC's own ``close`` waits until the system has given up what a dead connection still had to
     send, for 5 seconds and more.
+
+    Returns:
+        Who closes them.
     """
-    thread = threading.Thread(target=channel.close, name="comvla-discard", daemon=True)
-    thread.start()
+
+    def close() -> None:
+        for channel in channels:
+            channel.close()
+
+    thread = threading.Thread(target=close, name="comvla-discard", daemon=True)
+    if channels:
+        thread.start()
     return thread

@@ -162,7 +162,7 @@ class GrpcTransport:
             self._warm_up.close()
         self._revival.wake()
         with self._lock:
-            closing = discard(self._channel)
+            closing = discard([self._channel])
             idle = self._calls == 0
         if idle:  # else the call under way does it when it ends
             self._revival.reset()
@@ -224,7 +224,7 @@ class GrpcTransport:
             left_s = deadline - time.monotonic()
             call = start(self._stub(self._channel), left_s, self._access.metadata())
             try:
-                return call.result(timeout=min(left_s, self._revival.patience_s))
+                return call.result(timeout=min(left_s, self._revival.pace.patience_s))
             except grpc.FutureTimeoutError:
                 self._revival.suspect()
         return self._first_answer(call, start, deadline)
@@ -241,6 +241,7 @@ class GrpcTransport:
             grpc.FutureTimeoutError: the time is over.
         """
         current, spare, won = self._channel, None, None
+        enough_s = self._revival.pace.enough_s(deadline - time.monotonic())
         calls: dict[grpc.Channel, Any] = {} if call is None else {current: call}
         self._revival.watch(current, calls.values())
         try:
@@ -252,19 +253,19 @@ class GrpcTransport:
                     won = (answered or done)[0]
                     return calls[won].result()
                 over = None
-                if spare is None and (spare := self._revival.take_spare()) is not None:
-                    over = spare
+                if spare is None and left_s >= enough_s:
+                    over = spare = self._revival.take_spare()
                 # A dead connection is given nothing more: it would be in the way after its revival.
-                elif not calls and not self._revival.given_up:
+                if over is None and not calls and not self._revival.given_up:
                     over = current
                 if over is not None:
                     calls[over] = start(self._stub(over), left_s, self._access.metadata())
                     calls[over].add_done_callback(lambda _: self._revival.wake())
-                self._revival.wait(left_s)
+                self._revival.wait(left_s, settled=spare is not None)
             raise grpc.FutureTimeoutError()
         finally:
             if spare is not None and won is current:
-                discard(spare)
+                discard([spare])
             elif spare is not None:
                 self._replace(spare)
             for other in calls.values():
@@ -278,8 +279,8 @@ class GrpcTransport:
         with self._lock:
             stale, self._channel = self._channel, fresh
         if self._closed.is_set():  # closed meanwhile, perhaps before the exchange
-            discard(fresh)
-        discard(stale)
+            discard([fresh])
+        discard([stale])
         self._revival.reset()
 
     @staticmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -15,6 +16,7 @@ from comvla.v1.policy_pb2 import GetModelRequest, GetModelResponse, InferRequest
 from comvla_client import channel
 from comvla_client.access import Access, Metadata, TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
+from comvla_client.revival_aio import AsyncRevival
 from comvla_client.streaming import PayloadStream, paced_async
 
 Start = Callable[[Any, float, Metadata], Any]
@@ -48,8 +50,7 @@ class AsyncProgressiveTransport(AsyncTransport, Protocol):
 class GrpcAioTransport:
     """:class:`comvla_client.transport.GrpcTransport` on the running event loop.
 
-    It makes a new connection after two calls in a row without an answer. It does not look for one
-    while a call is under way (:mod:`comvla_client.revival`), and sends no filler.
+    A connection that went silent is replaced in the same way; filler is not sent.
 
     Args:
         target: ``host:port``.
@@ -73,7 +74,7 @@ class GrpcAioTransport:
         self.target = target
         self._access = Access(target, tls, token, insecure=insecure)
         self._closed = asyncio.Event()
-        self._unanswered = 0
+        self._revival = AsyncRevival(self._access.aio_channel, self._access.metadata)
         self._channel: grpc.aio.Channel | None = None
 
     async def get_model(self, timeout_s: float) -> GetModelResponse:
@@ -115,52 +116,63 @@ class GrpcAioTransport:
     async def close(self) -> None:
         """Ends calls under way with ClientClosedError. Closing twice does no harm."""
         self._closed.set()
-        await self._drop_channel()
+        self._revival.reset()
+        stale, self._channel = self._channel, None
+        if stale is not None:
+            await stale.close()
 
     async def _call(self, start: Start, timeout_s: float) -> Any:
         attempts = channel.Attempts(timeout_s)
-        if self._unanswered >= channel.FRESH_CHANNEL_AFTER:
-            await self._drop_channel()
         while True:
             try:
-                answer = await self._attempt(start, attempts.remaining_s())
+                return await self._attempt(start, attempts.remaining_s())
             except TransportError as error:
                 await asyncio.sleep(attempts.pause_s(error))
-                await self._drop_channel()
-            else:
-                self._unanswered = 0
-                return answer
+                if not self._closed.is_set():
+                    self._replace(self._access.aio_channel())
 
     async def _attempt(self, start: Start, timeout_s: float) -> Any:
-        if self._closed.is_set():
-            raise self._closed_error()
+        self._check_open()
         if self._channel is None:
             # Made here and not before, because a channel belongs to the loop that runs.
             self._channel = self._access.aio_channel()
-        stub = policy_pb2_grpc.PolicyServiceStub(self._channel)
+        began = time.monotonic()
+
+        def call(over: grpc.aio.Channel, left_s: float) -> Any:
+            stub = policy_pb2_grpc.PolicyServiceStub(over)
+            return start(stub, left_s, self._access.metadata())
+
         try:
-            answer = start(stub, timeout_s, self._access.metadata())
             # gRPC's own timer may fire late; this wait does not.
-            return await asyncio.wait_for(answer, timeout_s)
+            answer = await self._revival.answer(call, self._channel, timeout_s, self._replace)
         except asyncio.TimeoutError:
-            self._unanswered += 1
+            self._check_open()
+            self._revival.suspected = True
             raise channel.unanswered(timeout_s) from None
         except (grpc.RpcError, grpc.aio.UsageError) as error:
             if self._closed.is_set() or not isinstance(error, grpc.RpcError):
                 raise self._closed_error() from error
             failure = channel.transport_error(error)
-            self._unanswered += channel.is_silence(failure)
+            if channel.is_silence(failure):
+                self._revival.suspected = True
             raise failure from error
         except asyncio.CancelledError as error:
             # Closing the channel cancels its calls; a cancelled task is another matter.
             if self._closed.is_set():
                 raise self._closed_error() from error
             raise
+        self._revival.heard(time.monotonic() - began)
+        return answer
 
-    async def _drop_channel(self) -> None:
-        stale, self._channel, self._unanswered = self._channel, None, 0
+    def _replace(self, fresh: grpc.aio.Channel) -> None:
+        stale, self._channel = self._channel, fresh
         if stale is not None:
-            await stale.close()
+            self._revival.discard(stale)
+        self._revival.reset()
+
+    def _check_open(self) -> None:
+        if self._closed.is_set():
+            raise self._closed_error()
 
     def _closed_error(self) -> ClientClosedError:
         return ClientClosedError(f"the connection to {self.target} was closed: make a new client")

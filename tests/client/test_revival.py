@@ -10,7 +10,7 @@ import pytest
 from client_stubs import NARROW, WORDS, StubEdge, StubService, observation, serving
 from frozen_proxy import FrozenProxy
 
-from comvla_client import ComVLAClient
+from comvla_client import AsyncComVLAClient, ComVLAClient
 from comvla_client.revival import PATIENCE_S
 
 OBS = observation()
@@ -19,6 +19,11 @@ OBS = observation()
 def client_of(target: str, **options: Any) -> ComVLAClient:
     defaults: dict[str, Any] = {"edge": StubEdge(), "link": NARROW, "budget": 4, "execute": 1}
     return ComVLAClient(target, **(defaults | options))
+
+
+def async_client_of(target: str, **options: Any) -> AsyncComVLAClient:
+    defaults: dict[str, Any] = {"edge": StubEdge(), "link": NARROW, "budget": 4, "execute": 1}
+    return AsyncComVLAClient(target, **(defaults | options))
 
 
 def port_of(target: str) -> int:
@@ -86,3 +91,38 @@ def test_closing_does_not_wait_for_a_dead_connection() -> None:
         began = time.perf_counter()
         client.close()
         assert time.perf_counter() - began < 1.0
+
+
+async def test_an_asyncio_step_finds_its_way_around_a_dead_connection_too() -> None:
+    with serving() as (target, service), FrozenProxy(port_of(target)) as proxy:
+        async with async_client_of(proxy.target, deadline_s=20.0) as client:
+            assert (await client.step(OBS, WORDS)).source == "cloud"
+            proxy.freeze()
+            proxy.thaw()
+            chunk = await client.step(OBS, WORDS)
+            assert chunk.source == "cloud"
+            assert chunk.report.timings_s["total"] < 10.0
+    assert proxy.accepted >= 2
+    assert {request.step for request in service.requests} == {0, 1}
+
+
+async def test_an_asyncio_robot_goes_on_as_soon_as_the_link_is_back() -> None:
+    with serving() as (target, _), FrozenProxy(port_of(target)) as proxy:
+        async with async_client_of(proxy.target, deadline_s=0.1) as client:
+            assert (await client.step(OBS, WORDS)).source == "cloud"
+            proxy.freeze()
+            held = [await client.step(OBS, WORDS) for _ in range(5)]
+            assert {chunk.source for chunk in held} == {"rest"}
+            proxy.thaw()
+            after = [await client.step(OBS, WORDS) for _ in range(30)]
+    assert "cloud" in [chunk.source for chunk in after]
+
+
+async def test_an_asyncio_client_asks_a_server_that_is_only_slow_once() -> None:
+    service, release = StubService(), threading.Event()
+    with serving(service) as (target, _), FrozenProxy(port_of(target)) as proxy:
+        async with async_client_of(proxy.target, deadline_s=20.0) as client:
+            assert (await client.step(OBS, WORDS)).source == "cloud"
+            service.before = lambda request, context: release.wait(6 * PATIENCE_S) and None
+            assert (await client.step(OBS, WORDS)).source == "cloud"
+    assert [request.step for request in service.requests] == [0, 1]

@@ -115,7 +115,7 @@ def test_no_period_passes_more_than_its_capacity(link: NamespaceLink) -> None:
     assert len(seen.period_bytes) >= periods - 2
     # A packet that began in one period may end in the next.
     assert max(seen.period_bytes) <= capacity + wires.ETHERNET_HEADER_BYTES + 1500
-    assert link.driver_lateness()["periods"] > 0
+    assert link.punctuality().late["periods"] > 0
     with pytest.raises(LinkError, match="follows a channel already"):
         link.follow(ConstantChannel(10.0))
 
@@ -212,7 +212,7 @@ def test_a_device_that_vanishes_is_told(root: None) -> None:
 
 def _has_ended(link: NamespaceLink) -> bool:
     try:
-        link.driver_lateness()
+        link.punctuality()
     except LinkError as error:
         return "was the link taken down" in str(error)
     return False

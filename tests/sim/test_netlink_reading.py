@@ -130,7 +130,8 @@ def test_a_query_is_in_time_by_what_the_capture_saw_and_the_robot_got() -> None:
         Call(5, 100.05, 100.09, 70_000, 100.09, session="r.0", step=1),  # over another connection
         Call(7, 100.1, 100.2, 70_000, 100.2, session="r.0", step=2),
     ]
-    joined = account.join(records, calls, 0.05)
+    joined = account.join(records, calls, 0.05, stolen_periods=[1])
+    assert [q["stolen"] for q in joined] == [False, True, True, False]
     assert [q["payload_in_time"] for q in joined] == [True, True, False, False]
     assert [q["answer_in_time"] for q in joined] == [True, False, False, False]
 

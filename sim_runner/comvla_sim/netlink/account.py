@@ -19,7 +19,10 @@ USEFUL_TOKENS = 20
 
 
 def join(
-    records: Sequence[dict[str, Any]], calls: Iterable[Call], period_s: float
+    records: Sequence[dict[str, Any]],
+    calls: Iterable[Call],
+    period_s: float,
+    stolen_periods: Iterable[int] = (),
 ) -> list[dict[str, Any]]:
     """Adds to each query when its payload had passed the wire, and whether all was in time.
 
@@ -29,7 +32,10 @@ def join(
         records: the robot's, in order.
         calls: the capture's.
         period_s: T.
+        stolen_periods: in which the host took time from this machine; a query of such a period, or
+            of the one after, is marked.
     """
+    stolen = set(stolen_periods)
     seen: dict[tuple[str, int], Call] = {}
     for call in calls:
         if call.step is None:
@@ -47,6 +53,7 @@ def join(
             {
                 **record,
                 "sent": bool(record["tokens"]),
+                "stolen": bool(stolen & {record["period"], record["period"] - 1}),
                 "passed_bytes": 0 if call_seen is None else call_seen.data_bytes,
                 "complete_after_s": after_s,
                 "payload_in_time": after_s is not None and after_s <= period_s,
@@ -73,6 +80,7 @@ def summarise(
         mtu_bytes: largest IP packet.
     """
     sent = [query for query in queries if query["sent"]]
+    undisturbed = [query for query in sent if not query["stolen"]]
     tokens = np.array([query["tokens"] for query in queries])
     used = np.array([query["tokens_used"] for query in queries])
     periods = max((query["period"] for query in queries), default=0) + 1
@@ -86,6 +94,9 @@ def summarise(
         "payload_in_time_of_sent": share(sum(q["payload_in_time"] for q in sent), len(sent)),
         "answer_in_time": share(sum(q["answer_in_time"] for q in queries), len(queries)),
         "answer_in_time_of_sent": share(sum(q["answer_in_time"] for q in sent), len(sent)),
+        "answer_in_time_undisturbed": share(
+            sum(q["answer_in_time"] for q in undisturbed), len(undisturbed)
+        ),
         "useful_answer_in_time": share(
             sum(q["answer_in_time"] and q["tokens_used"] >= USEFUL_TOKENS for q in queries),
             len(queries),

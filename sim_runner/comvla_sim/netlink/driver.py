@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Iterable
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from comvla.errors import LinkError
 from comvla_client import LinkProfile
@@ -14,6 +15,9 @@ from comvla_sim.bench.processes import announce
 from comvla_sim.netlink.realtime import prefer_this_thread, settle, wait_until
 from comvla_sim.netlink.shaper import Shaper
 from comvla_sim.netlink.wires import Side
+
+STOLEN_TICKS = 2
+"""A period in which the host took so many ticks from this machine says nothing about the link."""
 
 _FIRST_LEAD_S = 0.0015
 
@@ -40,6 +44,8 @@ def serve(
     """
     lead_s = _FIRST_LEAD_S
     late_s: list[float] = []
+    stolen: list[int] = []
+    before = stolen_ticks()
     with Shaper(side, mtu_bytes=mtu_bytes, period_s=link.period_s) as shaper:
         capacities_bytes = (link.capacity_bits(snr_db) / 8.0 for snr_db in channel)
         shaper.set_capacity(next(capacities_bytes))
@@ -56,12 +62,26 @@ def serve(
                 took_s = time.monotonic() - began
                 lead_s += 0.1 * (min(took_s, 5 * lead_s) - lead_s)
                 late_s.append(began + took_s - boundary)
+                now = stolen_ticks()
+                if now - before >= STOLEN_TICKS:
+                    stolen.append(period - 1)
+                before = now
                 if lifeline.poll():
                     lifeline.recv_bytes()
-                    lifeline.send_bytes(json.dumps(summary_of(late_s)).encode())
+                    answer = {"late": summary_of(late_s), "stolen_periods": stolen}
+                    lifeline.send_bytes(json.dumps(answer).encode())
         except EOFError:
             return
     raise LinkError("the channel ended; those of comvla_sim.channel go on for ever")
+
+
+def stolen_ticks() -> int:
+    """Time that a virtual machine's host has taken from its processors so far, in ticks of 10 ms."""
+    try:
+        line = Path("/proc/stat").read_text(encoding="ascii").partition("\n")[0]
+        return int(line.split()[8])
+    except (OSError, IndexError, ValueError):
+        return 0
 
 
 def summary_of(late_s: list[float]) -> dict[str, float]:

@@ -89,7 +89,7 @@ def main(argv: Sequence[str]) -> int:
             )
             while True:
                 time.sleep(1.0)
-                link.driver_lateness()  # raises where the device has vanished
+                link.punctuality()  # raises where the device has vanished
     except KeyboardInterrupt:
         return 0
     except ComVLAError as error:

@@ -54,6 +54,19 @@ class LinkSettings:
             raise LinkError(f"expected an MTU of 576 to 9000 bytes, got {self.mtu_bytes!r}")
 
 
+@dataclass(frozen=True)
+class Punctuality:
+    """How well the changes of capacity kept time.
+
+    Attributes:
+        late: periods, median_s, p99_s and max_s of their lateness in seconds; negative is early.
+        stolen_periods: periods in which the host of a virtual machine took time from it.
+    """
+
+    late: dict[str, float]
+    stolen_periods: list[int]
+
+
 class NamespaceLink:
     """Two namespaces and the radio between them. A context manager.
 
@@ -131,18 +144,18 @@ class NamespaceLink:
         self._driver.send_bytes(str(start).encode())
         return start
 
-    def driver_lateness(self) -> dict[str, float]:
-        """How late the changes of capacity were so far: median, 99th percentile, maximum, seconds.
+    def punctuality(self) -> Punctuality:
+        """How well the process that follows the channel kept time so far.
 
         Raises:
-            LinkError: the process that makes them has ended, e.g. because its device vanished.
+            LinkError: that process has ended, e.g. because its device vanished.
         """
         assert self._driver is not None, "only a link that follows a channel has a driver"
         try:
             self._driver.send_bytes(b"?")
             if self._driver.poll(10.0):
-                answer: dict[str, float] = json.loads(self._driver.recv_bytes())
-                return answer
+                answer = json.loads(self._driver.recv_bytes())
+                return Punctuality(answer["late"], answer["stolen_periods"])
         except (OSError, EOFError):
             pass
         raise LinkError(

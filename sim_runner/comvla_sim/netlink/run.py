@@ -151,11 +151,11 @@ def run(
         capture.count_periods(start, profile.period_s)
         asking.send_bytes(str(start).encode())
         records = _records(asking, settings.queries, on_progress)
-        late = link.driver_lateness()
+        kept = link.punctuality()
         captured = capture.result()
         described = link.describe()
     where["load_average_at_end"] = os.getloadavg()[0]
-    queries = account.join(records, captured.calls, profile.period_s)
+    queries = account.join(records, captured.calls, profile.period_s, kept.stolen_periods)
     return {
         "settings": {
             **asdict(settings),
@@ -167,7 +167,7 @@ def run(
         "environment": where,
         "measured_before": json.loads(measured),
         "summary": account.summarise(queries, captured, profile, channel, settings.mtu_bytes),
-        "change_lateness": late,
+        "change_lateness": kept.late,
         "queries": queries,
     }
 

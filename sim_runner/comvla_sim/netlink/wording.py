@@ -27,6 +27,10 @@ def describe_run(account: Mapping[str, Any]) -> str:
             ("payload_in_time", "payload through within the period"),
             ("answer_in_time", "answer within the period"),
             ("answer_in_time_of_sent", "answer within the period, of those sent"),
+            (
+                "answer_in_time_undisturbed",
+                "the same, where the host took no time from this machine",
+            ),
             ("useful_answer_in_time", "answer within the period to 20 tokens or more"),
             ("larger_than_capacity", "larger than the period's capacity"),
         )
