@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -70,23 +73,29 @@ def _new(args: argparse.Namespace) -> int:
             raise TokensError(f"expected {name} as a finite number above 0, got {value}")
     limits = Limits(args.requests_per_s, args.bytes_per_s, args.max_request_bytes)
     token = new_token()
-    text = args.file.read_text() if args.file.exists() else ""
-    known = read_lines(args.file, "--file") if text.strip() else []
-    for line in known:
-        if line.identity.name == args.identity and line.identity.limits != limits:
-            raise TokensError(
-                f"{args.identity} is in {args.file} with other limits: give the same, or revoke its "
-                "tokens first"
-            )
-    if text and not text.endswith("\n"):
-        text += "\n"
-    _write(args.file, f"{text}{TokenLine.of(Identity(args.identity, limits), token)}\n")
+    with _alone(args.file):
+        _append(args.file, TokenLine.of(Identity(args.identity, limits), token))
     print(token)
     print(
         f"comvla-server: {args.identity} was added to {args.file}; this token is shown only now",
         file=sys.stderr,
     )
     return 0
+
+
+def _append(path: Path, added: TokenLine) -> None:
+    text = path.read_text() if path.exists() else ""
+    known = read_lines(path, "--file") if text.strip() else []
+    identity = added.identity
+    for line in known:
+        if line.identity.name == identity.name and line.identity.limits != identity.limits:
+            raise TokensError(
+                f"{identity.name} is in {path} with other limits: give the same, or revoke its "
+                "tokens first"
+            )
+    if text and not text.endswith("\n"):
+        text += "\n"
+    _write(path, f"{text}{added}\n")
 
 
 def _list(args: argparse.Namespace) -> int:
@@ -100,6 +109,13 @@ def _list(args: argparse.Namespace) -> int:
 
 def _revoke(args: argparse.Namespace) -> int:
     """Raises TokensError: nobody of that name has a token, or it would leave the file without any."""
+    with _alone(args.file):
+        removed = _remove(args)
+    print(f"comvla-server: {removed} of {args.identity} revoked in {args.file}", file=sys.stderr)
+    return 0
+
+
+def _remove(args: argparse.Namespace) -> int:
     kept, removed = [], 0
     left = len(read_lines(args.file, "--file"))
     for text in args.file.read_text().splitlines(keepends=True):
@@ -120,8 +136,28 @@ def _revoke(args: argparse.Namespace) -> int:
             "another first, or stop the server and delete the file"
         )
     _write(args.file, "".join(kept))
-    print(f"comvla-server: {removed} of {args.identity} revoked in {args.file}", file=sys.stderr)
-    return 0
+    return removed
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Nobody else changes the file meanwhile.
+
+    The folder is locked and not the file, which is replaced by each change.
+    """
+    try:
+        folder = os.open(path.absolute().parent, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
+
+
+def _unwritable(path: Path, error: OSError) -> TokensError:
+    return TokensError(f"cannot write {path}: {error.strerror or error}; choose another --file")
 
 
 def _write(path: Path, text: str) -> None:
@@ -143,6 +179,4 @@ def _write(path: Path, text: str) -> None:
             os.unlink(temporary)
             raise
     except OSError as error:
-        raise TokensError(
-            f"cannot write {path}: {error.strerror or error}; choose another --file"
-        ) from error
+        raise _unwritable(path, error) from error

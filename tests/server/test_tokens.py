@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import stat
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -140,6 +141,17 @@ def test_new_prints_the_secret_once_and_keeps_its_hash(
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     found = TokenFile(path, "tokens_file").find(token)
     assert found == Identity("arm-7", Limits(20.0, None, 300_000))
+
+
+def test_tokens_that_are_made_at_once_are_all_kept(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    robots = [f"arm-{number}" for number in range(24)]
+    with ThreadPoolExecutor(8) as pool:
+        results = pool.map(
+            lambda name: cli.main(["token", "new", name, "--file", str(path)]), robots
+        )
+        assert set(results) == {0}
+    assert sorted(line.identity.name for line in read_lines(path, "--file")) == sorted(robots)
 
 
 def test_tokens_are_listed_and_revoked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

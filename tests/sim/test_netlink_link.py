@@ -221,8 +221,10 @@ def _has_ended(link: NamespaceLink) -> bool:
 def test_up_status_and_down_from_the_command_line(
     root: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert comvla_sim.cli.main(["link", "up", "--delay-ms", "3", "--json"]) == 0
-    up = json.loads(capsys.readouterr().out)
+    command = [sys.executable, "-m", "comvla_sim.cli", "link", "up", "--delay-ms", "3", "--json"]
+    # Both pipes end with the command, though the link stays.
+    made = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+    up = json.loads(made.stdout)
     assert {up["robot"], up["cloud"]} <= there()
     assert up["settings"]["delay_s"] == 0.003
     assert comvla_sim.cli.main(["link", "status", "--json"]) == 0

@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -35,17 +36,22 @@ def start(arguments: Sequence[str]) -> dict[str, Any]:
     Raises:
         LinkError: the link did not come up; with the keeper's reason.
     """
-    process = subprocess.Popen(
-        [sys.executable, "-m", "comvla_sim.netlink.keeper", *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stdout is not None
-    with process.stdout:
-        line = process.stdout.readline()
-    said: dict[str, Any] = json.loads(line) if line else {"error": "it ended without a word"}
+    # Not this process's own standard error: who waits for its end must not wait for the link's.
+    with tempfile.TemporaryFile("w+") as complaints:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "comvla_sim.netlink.keeper", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=complaints,
+            text=True,
+            start_new_session=True,
+        )
+        assert process.stdout is not None
+        with process.stdout:
+            line = process.stdout.readline()
+        complaints.seek(0)
+        last = (complaints.read().strip().splitlines() or ["it ended without a word"])[-1]
+    said: dict[str, Any] = json.loads(line) if line else {"error": last}
     if "error" in said:
         process.wait(_UP_WITHIN_S)
         raise LinkError(said["error"])
