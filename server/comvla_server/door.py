@@ -23,7 +23,7 @@ from comvla_server.log_throttle import LogThrottle
 from comvla_server.metrics import Metrics
 from comvla_server.rate_limits import RateLimits
 from comvla_server.refusals import Reason, Refusal
-from comvla_server.service import STATUS
+from comvla_server.service import STATUS, hints
 from comvla_server.settings import ServerSettings
 from comvla_server.wording import shown
 
@@ -232,4 +232,4 @@ class _Entry:
     async def refuse(self, refusal: Refusal, context: _Context) -> Any:
         """Ends a call that may not go on."""
         self._door.note(refusal, self._method, context.peer())
-        await context.abort(STATUS[refusal.reason], refusal.message)
+        await context.abort(STATUS[refusal.reason], refusal.message, hints(refusal))

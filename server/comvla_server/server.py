@@ -15,11 +15,14 @@ from comvla_server.access import Access
 from comvla_server.admin import create_app
 from comvla_server.admin_http import AdminHttp
 from comvla_server.batcher import Batcher
+from comvla_server.calibration import calibrate
+from comvla_server.cost_model import CostModel
 from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
 from comvla_server.inference_thread import InferenceThread
 from comvla_server.lifecycle import Lifecycle, Phase
+from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
 from comvla_server.ports import add_grpc_port, authority, listen
 from comvla_server.service import PolicyService, Runtime
@@ -143,6 +146,8 @@ class Server:
         self._check_message_cap(engine)
         self.lifecycle.enter(Phase.WARMING)
         await thread.run(engine.warm_up, self.settings.max_batch)
+        costs = CostModel()
+        await thread.run(calibrate, engine, self.settings.max_batch, costs)
         if self.lifecycle.phase is not Phase.WARMING:
             return engine.info  # stopped meanwhile
         settings = self.settings
@@ -152,6 +157,8 @@ class Server:
             max_queue=settings.max_queue,
             max_sessions=settings.max_sessions,
             session_ttl_s=settings.session_ttl_s,
+            load=LoadPolicy.of(settings),
+            costs=costs,
             metrics=self.metrics,
             thread=thread,
         )
@@ -161,6 +168,8 @@ class Server:
             queue_depth=lambda: batcher.queue_depth,
             utilization=lambda: batcher.utilization,
             sessions=lambda: len(batcher.sessions),
+            offered_load=lambda: batcher.offered_load,
+            suggested_tokens=lambda: batcher.suggested_tokens,
         )
         validator = Validator(engine, settings.max_request_bytes)
         self._decode_thread = InferenceThread("comvla-decode")
