@@ -107,7 +107,8 @@ class Admission:
             self._policy.fair_shares
             and overloaded
             and not replaces
-            and len(waiting) >= self._max_batch
+            and 2 * len(waiting) >= self._max_batch
+            and wait_s > 0.5 * (place.deadline_s - now_s)
             and self._shares.above_mean(place.robot, now_s)
         ):
             raise Refusal(
