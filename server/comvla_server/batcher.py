@@ -147,6 +147,20 @@ class Batcher:
         work = Work(1, num_tokens, int(pictures))
         self._let_in(session_id, work, deadline_s, now_s, self._load.screen)
 
+    def glance(self, deadline_s: float) -> Refusal | None:
+        """Whether one more request like those of late could be answered in time; None where it could."""
+        now_s = self._clock()
+        work = self._load.usual_work()
+        place = Place("", work, deadline_s, deadline_s)
+        waiting = [s.queued.place for s in self._queue.values() if s.queued]
+        try:
+            self._load.screen(place, waiting, now_s, replaces=True)
+        except Refusal as late:
+            refusal = Refusal(Reason.CONGESTED, late.message, retry_after_s=late.retry_after_s)
+            refusal.suggested_tokens = self._load.suggested_tokens(now_s)
+            return refusal
+        return None
+
     def admit(
         self,
         session_id: str,

@@ -42,6 +42,7 @@ else:
 
 _Context = Any  # grpc.aio.ServicerContext
 _HEALTH = f"/{health.SERVICE_NAME}/"
+_INFER = "/comvla.v1.PolicyService/Infer"  # and InferProgressive
 
 # Of the calls that may be open, the share left to health checks, which need no token: strangers who
 # watch the server's health must not keep robots out.
@@ -59,6 +60,10 @@ class Door(grpc.aio.ServerInterceptor):
         limits: what each may send.
         settings: how long to wait for a request, and how many calls may be open.
         metrics: where refusals are counted.
+
+    Attributes:
+        glance: asked before a call for actions is looked at, with the seconds that it has: a refusal where it would
+            be read in vain.
     """
 
     def __init__(
@@ -75,6 +80,7 @@ class Door(grpc.aio.ServerInterceptor):
         self._health_calls = 0
         self._metrics = metrics
         self._throttle = LogThrottle(time.monotonic)
+        self.glance: Callable[[float | None], Refusal | None] = lambda time_remaining_s: None
 
     async def intercept_service(
         self,
@@ -206,11 +212,16 @@ class _Entry:
     def __init__(self, door: Door, method: str, streams: bool, parse: Any) -> None:
         self._door = door
         self._method = method
+        self._for_actions = method.startswith(_INFER)
         self._streams = streams
         self._parse = parse or (lambda message: message)
 
     async def admit(self, requests: AsyncIterator[bytes], context: _Context) -> Any:
         """The request, or the stream of them, of a call that may come in."""
+        if self._for_actions:
+            refusal = self._door.glance(context.time_remaining())
+            if refusal is not None:
+                await self.refuse(refusal, context)
         try:
             identity = self._door.begin(self._method, context)
             messages = aiter(requests)

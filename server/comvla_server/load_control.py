@@ -127,6 +127,10 @@ class LoadControl:
         # What takes longer than expected may take as much longer again.
         return now_s + max(predicted_s - elapsed_s, elapsed_s - predicted_s, 1e-6)
 
+    def usual_work(self) -> Work:
+        """What requests of late took, on average."""
+        return self._offered.usual_work()
+
     def utilization(self, now_s: float) -> float:
         """Busy share of the inference thread over the last seconds, 0 to 1."""
         return self._busy.utilization(now_s)
@@ -140,5 +144,6 @@ class LoadControl:
         return self._offered.advice(now_s)
 
     def _note_asked(self, place: Place, now_s: float) -> None:
-        self._shares.note_asked(place.robot, now_s)
+        if place.robot:
+            self._shares.note_asked(place.robot, now_s)
         self._offered.note(place.work, now_s)

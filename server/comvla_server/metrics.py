@@ -17,7 +17,13 @@ SNR_BUCKETS = (-10, -5, 0, 2.5, 5, 7.5, 10, 12.5, 15, 17.5, 20, 25, 30, 40)
 TOKEN_BUCKETS = (1, 4, 8, 16, 32, 48, 64, 96, 128, 256, 512)
 BATCH_BUCKETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
-DOOR_REASONS = (Reason.NO_IDENTITY, Reason.RATE, Reason.OVERSIZE, Reason.SLOW)
+DOOR_REASONS = (
+    Reason.NO_IDENTITY,
+    Reason.RATE,
+    Reason.OVERSIZE,
+    Reason.SLOW,
+    Reason.CONGESTED,
+)
 """Why a call can be turned away before it reaches a service."""
 
 

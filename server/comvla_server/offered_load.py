@@ -69,6 +69,11 @@ class OfferedLoad:
         whole_s = -math.expm1(min(0.0, self._began_s - now_s) / _MEMORY_S) * _MEMORY_S
         return self._sums[0] * self._fade(now_s) / max(whole_s, 0.25 * _MEMORY_S)
 
+    def usual_work(self) -> Work:
+        """The mean request of late, as one that brings tokens."""
+        requests, tokens, _ = self._sums
+        return Work(1, max(1, round(tokens / requests)) if requests else 1)
+
     def load(self, now_s: float) -> float:
         """Work asked for as a share of what the model can do with full batches; above 1 is too much."""
         requests, tokens, pictures = self._sums

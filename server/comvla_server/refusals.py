@@ -18,6 +18,7 @@ class Reason(str, Enum):
     OVERSIZE = "oversize"  # message larger than the cap
     OVERLOAD = "overload"  # queue full, or too many bytes in flight
     PREDICTED_LATE = "predicted_late"  # it, or one let in before, could not be answered in time
+    CONGESTED = "congested"  # like predicted_late, told before the request was read
     FAIR_SHARE = "fair_share"  # too much is asked for, and this robot got more than others
     SHORT = "short"  # too few tokens of a payload in pieces arrived within its window
     KEY_FRAME = "key_frame"  # a picture that builds on one which is not held here

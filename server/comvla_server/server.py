@@ -69,7 +69,7 @@ class Server:
         self._grpc: grpc.aio.Server | None = None
         self._admin: AdminHttp | None = None
         self._access: Access | None = None
-        self._watching: asyncio.Task[None] | None = None
+        self._watching: list[asyncio.Task[None]] = []
         self._thread: InferenceThread | None = None
         self._decode_thread: InferenceThread | None = None
 
@@ -109,6 +109,7 @@ class Server:
         access = Access(settings, self.metrics)
         server = make_grpc_server(settings, [access.door])
         service = PolicyService(self.lifecycle, self.metrics, settings)
+        access.door.glance = service.glance
         add_policy_service(server, service)
         await self._health.register(server)
         admin_socket = listen(settings.admin_address, settings.admin_port, "--admin-port")
@@ -127,7 +128,10 @@ class Server:
         self._admin.start()
         await server.start()
         self._access = access
-        self._watching = asyncio.create_task(access.watch())
+        self._watching = [
+            asyncio.create_task(access.watch()),
+            asyncio.create_task(service.loop_watch.run()),
+        ]
 
     async def make_ready(self) -> ModelInfo:
         """Loads and warms up in the inference thread, then says SERVING.
@@ -201,8 +205,8 @@ class Server:
             await self._grpc.stop(_FLUSH_S)
         if self._admin is not None:
             await self._admin.stop()
-        if self._watching is not None:
-            self._watching.cancel()
+        for task in self._watching:
+            task.cancel()
         if self._thread is not None:
             self._thread.close(timeout_s=1.0 if finished else 0.0)
         if self._decode_thread is not None:

@@ -21,6 +21,7 @@ from comvla_server.batcher import Batcher
 from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle
+from comvla_server.loop_watch import LoopWatch
 from comvla_server.memory import BytesInFlight, Lease
 from comvla_server.metrics import Metrics
 from comvla_server.piecewise import PieceReader
@@ -39,6 +40,7 @@ STATUS = {
     Reason.OVERSIZE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.OVERLOAD: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.PREDICTED_LATE: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Reason.CONGESTED: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.FAIR_SHARE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.SHORT: grpc.StatusCode.DEADLINE_EXCEEDED,
     Reason.KEY_FRAME: grpc.StatusCode.ABORTED,
@@ -81,6 +83,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
     Attributes:
         runtime: the loaded model behind its queue, None while loading.
+        loop_watch: whether the event loop keeps up; runs where its ``run`` does.
     """
 
     def __init__(
@@ -95,6 +98,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         self._metrics = metrics
         self._settings = settings
         self._clock = clock
+        self.loop_watch = LoopWatch()
         self._accounts = CallAccounts(metrics, settings.default_deadline_s, clock)
         self._in_flight = BytesInFlight(settings.max_bytes_in_flight)
         metrics.watch_bytes(lambda: self._in_flight.held)
@@ -121,6 +125,19 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             image_codings=runtime.engine.image_codings,
             run_options=runtime.engine.run_options,
         )
+
+    def glance(self, time_remaining_s: float | None) -> Refusal | None:
+        """Whether a call that nobody has read yet can be answered in time; None where it may be.
+
+        Only where the event loop hardly keeps up: to read a request takes longer than to turn it away, and what is
+        turned away unread cannot be known for a repeat or for the newest observation of a robot that waits.
+
+        Args:
+            time_remaining_s: seconds until the caller gives up, None where it did not say.
+        """
+        if self.runtime is None or not self.loop_watch.congested or time_remaining_s is None:
+            return None
+        return self.runtime.batcher.glance(self._clock() + time_remaining_s)
 
     async def Infer(
         self, request: policy_pb2.InferRequest, context: grpc.aio.ServicerContext[Any, Any]
