@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import attrgetter
 
 from comvla_server.cost_model import CostModel, Work
 from comvla_server.fairness import FairShares
@@ -45,7 +46,7 @@ class Admission:
     def order(self, waiting: Sequence[Place]) -> list[Place]:
         """Who is computed first: whose place is due first, else in order of arrival."""
         if self._policy.earliest_deadline_first:
-            return sorted(waiting, key=_due)
+            return sorted(waiting, key=attrgetter("due_s"))
         return list(waiting)
 
     def finish_s(self, ordered: Sequence[Place], free_s: float) -> list[float]:
@@ -62,7 +63,7 @@ class Admission:
         margin_s = self._policy.deadline_margin_s + self.lag_s
         for passes, start in enumerate(range(0, len(ordered), self._max_batch), 1):
             batch = ordered[start : start + self._max_batch]
-            free_s += self._costs.predict(Work.of(place.work for place in batch))
+            free_s += self._costs.predict(Work.of([place.work for place in batch]))
             # Misses of several passes cancel out in part.
             spread_s = math.sqrt(passes) * self._costs.spread_s
             times += [free_s + spread_s + margin_s] * len(batch)
@@ -102,7 +103,6 @@ class Admission:
         idle = not waiting and free_s <= now_s
         if not self._policy.admission or idle:
             return wait_s
-        pass_s = self._costs.predict(Work.of(other.work for other in ordered[: self._max_batch]))
         if (
             self._policy.fair_shares
             and overloaded
@@ -111,6 +111,7 @@ class Admission:
             and wait_s > 0.5 * (place.deadline_s - now_s)
             and self._shares.above_mean(place.robot, now_s)
         ):
+            pass_s = self._pass_s(ordered)
             raise Refusal(
                 Reason.FAIR_SHARE,
                 f"{len(waiting)} requests wait, and {shown(place.robot)} got more answers lately than "
@@ -119,7 +120,7 @@ class Admission:
             )
         if times[mine] > place.deadline_s:
             raise self._late(place, wait_s, now_s, times[mine] - place.deadline_s)
-        self._require_others(place, ordered, times, mine, free_s, wait_s, now_s, pass_s)
+        self._require_others(place, ordered, times, mine, free_s, wait_s, now_s)
         return wait_s
 
     def _require_others(
@@ -131,7 +132,6 @@ class Admission:
         free_s: float,
         wait_s: float,
         now_s: float,
-        pass_s: float,
     ) -> None:
         """Nobody who was let in may become late because of a new one."""
         first = mine - mine % self._max_batch
@@ -145,7 +145,12 @@ class Admission:
         without = [other for other in ordered if other is not place]
         before = dict(zip(map(id, without), self.finish_s(without, free_s), strict=True))
         if any(before[id(other)] <= other.deadline_s for other in late):
-            raise self._late(place, wait_s, now_s, pass_s)
+            raise self._late(place, wait_s, now_s, self._pass_s(ordered))
+
+    def _pass_s(self, ordered: list[Place]) -> float:
+        """Seconds of the next pass."""
+        batch = ordered[: self._max_batch]
+        return self._costs.predict(Work.of([place.work for place in batch]))
 
     def _late(self, place: Place, wait_s: float, now_s: float, excess_s: float) -> Refusal:
         retry_s = max(_LEAST_RETRY_S, excess_s)
@@ -156,7 +161,3 @@ class Admission:
             f"tokens; retry in {retry_s:.3f} s, send fewer tokens, or add a replica",
             retry_after_s=retry_s,
         )
-
-
-def _due(place: Place) -> float:
-    return place.due_s

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import mul
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +69,7 @@ class CostModel:
     def __init__(self) -> None:
         self._works: deque[tuple[float, float, float, float]] = deque(maxlen=_WINDOW)
         self._seconds: deque[float] = deque(maxlen=_WINDOW)
-        self._parts_s = np.zeros(4)
+        self._fitted_s: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
         self._level = 1.0
         self._since_fit = 0
         self.fixed_s = self.request_s = self.token_s = self.picture_s = 0.0
@@ -116,7 +118,7 @@ class CostModel:
         typical_s = float(np.median(seconds))
         # Dimensionless: each part as a share of a typical pass, at the window's mean work.
         rows, targets = works / scales, seconds / typical_s
-        prior = self._parts_s * self._level * scales / typical_s
+        prior = np.array(self._fitted_s) * self._level * scales / typical_s
         prior_rows = np.sqrt(_PRIOR_WEIGHT) * np.eye(4)
         weights = np.ones(len(targets))
         shares = prior
@@ -129,19 +131,20 @@ class CostModel:
             residuals = np.abs(targets - rows @ shares)
             limit = _HUBER * max(float(np.median(residuals)) / 0.6745, 1e-3)
             weights = np.minimum(1.0, limit / np.maximum(residuals, 1e-12))
-        self._parts_s = shares * typical_s / scales
+        self._fitted_s = tuple(map(float, shares * typical_s / scales))
+        misses_s = np.abs(targets - rows @ shares) * typical_s
+        self.spread_s = float(np.quantile(misses_s, _SPREAD_QUANTILE))
 
     def _follow(self) -> None:
-        works, seconds = np.array(self._works), np.array(self._seconds)
-        fitted_s = works @ self._parts_s
-        recent = np.s_[-_RECENT:]
-        usable = fitted_s[recent] > 0.0
-        ratios = seconds[recent][usable] / fitted_s[recent][usable]
-        self._level = float(np.median(ratios)) if len(ratios) else 1.0
-        parts = self._level * self._parts_s
-        self.fixed_s, self.request_s, self.token_s, self.picture_s = map(float, parts)
-        misses_s = np.abs(seconds - self._level * fitted_s)
-        self.spread_s = float(np.quantile(misses_s, _SPREAD_QUANTILE))
+        """Scales the fit by how the latest passes compare with it; plain numbers, since it runs after each."""
+        ratios = []
+        for i in range(-min(_RECENT, len(self._seconds)), 0):
+            fitted_s = sum(map(mul, self._works[i], self._fitted_s))
+            if fitted_s > 0.0:
+                ratios.append(self._seconds[i] / fitted_s)
+        self._level = median(ratios) if ratios else 1.0
+        parts = [self._level * part_s for part_s in self._fitted_s]
+        self.fixed_s, self.request_s, self.token_s, self.picture_s = parts
 
 
 def _least_squares(rows: _Array, targets: _Array) -> _Array:
