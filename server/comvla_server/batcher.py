@@ -42,7 +42,7 @@ class Batcher:
         max_sessions: most sessions whose last answer is remembered.
         session_ttl_s: silence after which a session is forgotten, seconds.
         load: what happens when more is asked than can be answered.
-        costs: what passes cost, calibrated where possible; learned from the first pass on.
+        costs: what passes cost; what the engine has learned where None.
         metrics: where batches, compute and failures are counted.
         thread: the inference thread; a new one where none is given.
         clock: monotonic seconds.
@@ -73,7 +73,7 @@ class Batcher:
             max_batch,
             engine.info.num_tokens,
             load or LoadPolicy(),
-            costs or CostModel(),
+            engine.costs if costs is None else costs,
             self._metrics,
         )
         # Sessions with an observation that waits, in order of arrival. A newer observation replaces

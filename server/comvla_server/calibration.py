@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from comvla_server.cost_model import CostModel, Work
-from comvla_server.engine import Engine
+
+if TYPE_CHECKING:
+    from comvla_server.engine import Engine
 
 BUDGET_S = 0.5
 """Longest that calibration may take, in seconds, beyond its first pass."""

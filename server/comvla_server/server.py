@@ -15,8 +15,6 @@ from comvla_server.access import Access
 from comvla_server.admin import create_app
 from comvla_server.admin_http import AdminHttp
 from comvla_server.batcher import Batcher
-from comvla_server.calibration import calibrate
-from comvla_server.cost_model import CostModel
 from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
@@ -150,8 +148,6 @@ class Server:
         self._check_message_cap(engine)
         self.lifecycle.enter(Phase.WARMING)
         await thread.run(engine.warm_up, self.settings.max_batch)
-        costs = CostModel()
-        await thread.run(calibrate, engine, self.settings.max_batch, costs)
         if self.lifecycle.phase is not Phase.WARMING:
             return engine.info  # stopped meanwhile
         settings = self.settings
@@ -162,7 +158,6 @@ class Server:
             max_sessions=settings.max_sessions,
             session_ttl_s=settings.session_ttl_s,
             load=LoadPolicy.of(settings),
-            costs=costs,
             metrics=self.metrics,
             thread=thread,
         )
