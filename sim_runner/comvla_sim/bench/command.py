@@ -136,6 +136,12 @@ def _overload_options(parser: argparse.ArgumentParser) -> None:
         help="offered, as multiples of the capacity measured (1.5,10)",
     )
     _fleet_options(parser, "stub", 128)
+    parser.add_argument(
+        "--cases",
+        type=lambda text: tuple(text.split(",")),
+        metavar="NAME,NAME,…",
+        help="of admission off, admission, advised K and back-off, each with what is before it (all)",
+    )
     parser.add_argument("--seconds", type=number(0.1), help="of each load (10)")
     parser.add_argument("--settle-s", type=number(0.0), help="before them, not counted (3)")
     parser.add_argument(

@@ -98,8 +98,6 @@ async def _soak(
     durations_s = [duration for tally in tallies for duration in tally.durations_s]
     warm = samples.between(seconds / 6.0, seconds / 6.0 + seconds / 30.0)
     last = samples.between(seconds - seconds / 30.0, seconds)
-    growth = _median(last, "resident_bytes") / _median(warm, "resident_bytes") - 1.0
-    descriptors_growth = _median(last, "descriptors") - _median(warm, "descriptors")
     answered = sum(t.answered for t in tallies)
     return {
         "bench": "soak",
@@ -114,6 +112,23 @@ async def _soak(
             _row(samples.between(i * seconds / 10.0, (i + 1) * seconds / 10.0), i + 1, seconds)
             for i in range(10)
         ],
+        **judge(warm, last),
+    }
+
+
+def judge(warm: list[ServerAccount], last: list[ServerAccount]) -> dict[str, Any]:
+    """Whether memory and descriptors stayed as they were.
+
+    Args:
+        warm: the server when it was warm.
+        last: the server at the end.
+
+    Returns:
+        ``growth`` of the resident memory as a share, ``descriptors_growth``, and whether it ``passed``.
+    """
+    growth = _median(last, "resident_bytes") / _median(warm, "resident_bytes") - 1.0
+    descriptors_growth = _median(last, "descriptors") - _median(warm, "descriptors")
+    return {
         "growth": growth,
         "descriptors_growth": descriptors_growth,
         "passed": growth < MOST_GROWTH and descriptors_growth <= _SPARE_DESCRIPTORS,
