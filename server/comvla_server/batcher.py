@@ -205,6 +205,7 @@ class Batcher:
                 "model; ask less often, send fewer tokens, or add a replica",
                 retry_after_s=max(0.001, self._load.free_s(now_s) - now_s),
             )
+            self._load.note_full(now_s)
             refusal.suggested_tokens = self._load.suggested_tokens(now_s)
             raise refusal
         place = Place(caller().name or session_id, work, deadline_s, deadline_s)

@@ -16,6 +16,8 @@ from comvla_server.tickets import Place
 
 # Per answer: the longest lag has lost half its weight after 34 answers.
 _LAG_FADES = 0.98
+# A deadline is in danger where waiting uses up more than this share of its time.
+_DANGER = 0.5
 
 
 class LoadControl:
@@ -74,6 +76,7 @@ class LoadControl:
             )
         except Refusal:
             self._note_asked(place, now_s)
+            self._offered.note_pressure(now_s)
             raise
 
     def let_in(
@@ -86,9 +89,15 @@ class LoadControl:
         """
         wait_s = self.screen(place, waiting, now_s, replaces=replaces)
         self._note_asked(place, now_s)
+        if wait_s > _DANGER * (place.deadline_s - now_s):
+            self._offered.note_pressure(now_s)
         self._metrics.predicted_wait.observe(max(0.0, wait_s))
         if not replaces:
             self._shares.credit(place.robot, now_s)
+
+    def note_full(self, now_s: float) -> None:
+        """Somebody was turned away because the queue is full."""
+        self._offered.note_pressure(now_s)
 
     def note_unanswered(self, place: Place, now_s: float) -> None:
         """Whoever was let in leaves without an answer."""

@@ -25,7 +25,9 @@ class OfferedLoad:
     full, so r · c = ρ says how many tokens a request may have on average. Robots whose link carries
     fewer than that leave room to the others: the level L advised is where the mean of min(K, L)
     meets it. It depends on how often robots ask, not on what they send after they were advised, so
-    it does not swing.
+    it does not swing. It begins when deadlines come into danger, since robots that wait for each
+    answer before they ask again keep a model busy and need no advice, and ends when there is time
+    for what robots would like to send.
 
     Args:
         costs: what passes cost.
@@ -47,6 +49,7 @@ class OfferedLoad:
         self._sums = (0.0, 0.0, 0.0)
         self._summed_s = self._began_s = -math.inf
         self._wishes: deque[int] = deque(maxlen=_WISHES)
+        self._pressed_s = -math.inf
         self._advice = 0
         self._advised_s = -math.inf
 
@@ -62,6 +65,10 @@ class OfferedLoad:
             # Whoever sends as much as advised would perhaps send more.
             free = self._advice == 0 or work.tokens < self._advice
             self._wishes.append(work.tokens if free else self._num_tokens)
+
+    def note_pressure(self, now_s: float) -> None:
+        """A deadline came into danger, or could not be kept."""
+        self._pressed_s = now_s
 
     def requests_per_s(self, now_s: float) -> float:
         """How often robots ask."""
@@ -92,6 +99,8 @@ class OfferedLoad:
         rate = self.requests_per_s(now_s)
         token_s = self._costs.token_s
         if rate <= 0.0 or token_s <= 0.0 or len(self._wishes) < _FEWEST_WISHES:
+            return 0
+        if not self._advice and now_s - self._pressed_s > _MEMORY_S:
             return 0
         pictures = self._sums[2] / self._sums[0]
         if pictures > 0.99:

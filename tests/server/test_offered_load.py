@@ -25,6 +25,7 @@ def fleet(load: OfferedLoad, rate: float, ks: list[int], seconds: float = 12.0) 
     for i in range(int(rate * seconds)):
         now_s = 1000.0 + i / rate
         load.note(Work(1, ks[i % len(ks)]), now_s)
+    load.note_pressure(now_s)
     return now_s
 
 
@@ -116,6 +117,19 @@ def test_pictures_take_their_share_and_are_not_advised() -> None:
     for i in range(360):  # 30 a second, every tenth with pictures
         now_s = 1000.0 + i / 30.0
         load.note(Work(1, N, 1) if i % 10 == 0 else Work(1, 300), now_s)
+    load.note_pressure(now_s)
     shared = FIXED_S / BATCH + REQUEST_S
     left_s = 0.8 / 30.0 - shared - 0.1 * (0.002 + N * TOKEN_S)
     assert load.advice(now_s) == pytest.approx(left_s / (TOKEN_S * 0.9), abs=8)
+
+
+def test_robots_that_keep_a_model_busy_and_their_deadlines_too_are_not_advised() -> None:
+    load = offered()
+    now_s = 1000.0
+    for i in range(1800):
+        now_s = 1000.0 + i / 150.0
+        load.note(Work(1, 100), now_s)
+    assert load.load(now_s) > 1.0
+    assert load.advice(now_s) == 0
+    load.note_pressure(now_s)
+    assert load.advice(now_s + 0.2) > 0

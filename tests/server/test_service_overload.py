@@ -86,8 +86,9 @@ def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics()
         def keep_asking(name: str) -> None:
             with Robot(server.target) as robot:
                 for step in range(1000):
-                    response = robot.infer(message(name, step, k=16))
-                    if 0 < response.load.suggested_tokens < 16:
+                    # About three passes: with four robots, deadlines are in danger.
+                    call = robot.send(message(name, step, k=16), timeout_s=0.1)
+                    if call.exception() is None and 0 < call.result().load.suggested_tokens < 16:
                         advised.set()
                     if advised.is_set():
                         return
