@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import ceil
+from typing import Any
 
 RETRY_AFTER_MS = "grpc-retry-pushback-ms"
 """When to try again, whole milliseconds; gRPC's own name for it."""
@@ -41,8 +42,8 @@ class LoadHints:
         return tuple(found)
 
     @classmethod
-    def from_metadata(cls, metadata: Iterable[tuple[str, str | bytes]] | None) -> LoadHints:
-        """Reads what a server sent; what is no hint counts as none."""
+    def from_metadata(cls, metadata: Iterable[Any] | None) -> LoadHints:
+        """Reads what a server sent, pairs of key and value; what is no hint counts as none."""
         found = {key: _whole(value) for key, value in metadata or ()}
         pause_ms = found.get(RETRY_AFTER_MS)
         return cls(

@@ -235,7 +235,7 @@ class _Robot:
             answer: bytes = await self._infer(message, timeout=deadline_s)
         except grpc.aio.AioRpcError as error:
             code = error.code().name
-            hints = LoadHints.from_metadata(error.trailing_metadata())  # type: ignore[arg-type]
+            hints = LoadHints.from_metadata(error.trailing_metadata())
             self.advice.hear(hints.suggested_tokens)
             if code == "RESOURCE_EXHAUSTED":
                 self.back_off.refused(hints.retry_after_s)

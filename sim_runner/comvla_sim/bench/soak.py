@@ -168,7 +168,7 @@ class _Samples:
 
 
 def _median(accounts: list[ServerAccount], name: str) -> float:
-    return statistics.median(getattr(account, name) for account in accounts)
+    return float(statistics.median(getattr(account, name) for account in accounts))
 
 
 def _row(accounts: list[ServerAccount], tenth: int, seconds: float) -> dict[str, Any]:
