@@ -40,6 +40,8 @@ else:
         return await asyncio.wait_for(message, timeout_s)
 
 
+_MOST_METHODS = 256
+
 _Context = Any  # grpc.aio.ServicerContext
 _HEALTH = f"/{health.SERVICE_NAME}/"
 _INFER = "/comvla.v1.PolicyService/Infer"  # and InferProgressive
@@ -80,6 +82,7 @@ class Door(grpc.aio.ServerInterceptor):
         self._health_calls = 0
         self._metrics = metrics
         self._throttle = LogThrottle(time.monotonic)
+        self._guards: dict[str, tuple[Any, Any]] = {}
         self.glance: Callable[[float | None], Refusal | None] = lambda time_remaining_s: None
 
     async def intercept_service(
@@ -91,7 +94,14 @@ class Door(grpc.aio.ServerInterceptor):
         handler = await continuation(handler_call_details)
         if handler is None:
             return None
-        return self._guarded(handler, handler_call_details.method)
+        # The same for all calls of a method, unless somebody makes handlers anew for each.
+        method = handler_call_details.method
+        behind, guarded = self._guards.get(method, (None, None))
+        if behind is not handler:
+            guarded = self._guarded(handler, method)
+            if len(self._guards) < _MOST_METHODS:
+                self._guards[method] = handler, guarded
+        return guarded
 
     def _guarded(self, handler: Any, method: str) -> Any:
         # On the wire a unary request is a stream of one message. Taken as a stream, the call reaches
