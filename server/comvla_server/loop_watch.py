@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 _TICK_S = 0.05
 _MEMORY = 0.7  # of the last value at each tick: half of it is forgotten after 0.1 s
-_BUSY = 0.8
-_LATE_S = 0.025
+_BUSY = 0.5
+_LATE_S = 0.005
 
 
 class LoopWatch:

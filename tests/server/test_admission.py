@@ -114,16 +114,26 @@ def test_under_overload_who_got_more_steps_back_and_who_got_less_does_not() -> N
         shares.note_asked(robot, NOW_S)
         shares.credit(robot, NOW_S, answers)
     judge = admission(shares)
-    waiting = [place(0.39, "a"), place(0.39, "b")]
-    refusal = refused(judge, place(0.4, "rich"), waiting, overloaded=True)
+    waiting = [place(0.49, "a"), place(0.49, "b")]
+    refusal = refused(judge, place(0.5, "rich"), waiting, overloaded=True)
     assert refusal.reason is Reason.FAIR_SHARE
     assert refusal.retry_after_s == pytest.approx(PASS_S)
-    assert ask(judge, place(0.4, "poor"), waiting, overloaded=True) > 0
+    assert ask(judge, place(0.5, "poor"), waiting, overloaded=True) > 0
     # Not without overload, not while there is room, and not for a newer observation.
-    assert ask(judge, place(0.4, "rich"), waiting) > 0
-    assert ask(judge, place(0.4, "rich"), [], overloaded=True) > 0
-    assert ask(judge, place(0.4, "rich"), waiting, overloaded=True, replaces=True) > 0
-    assert ask(admission(shares, fair_shares=False), place(0.4, "rich"), waiting, overloaded=True)
+    assert ask(judge, place(0.5, "rich"), waiting) > 0
+    assert ask(judge, place(0.5, "rich"), [], overloaded=True) > 0
+    assert ask(judge, place(0.5, "rich"), waiting, overloaded=True, replaces=True) > 0
+    assert ask(admission(shares, fair_shares=False), place(0.5, "rich"), waiting, overloaded=True)
+
+
+def test_under_overload_the_queue_leaves_time_to_spare() -> None:
+    judge, waiting = admission(), [place(0.3), place(0.3)]
+    assert ask(judge, place(0.3), waiting) == pytest.approx(0.25)
+    late = refused(judge, place(0.3), waiting, overloaded=True)
+    assert late.reason is Reason.PREDICTED_LATE
+    assert late.retry_after_s == pytest.approx(0.25 - 0.6 * 0.3)
+    # A batch that is not full yet costs nobody anything.
+    assert ask(judge, place(0.16), waiting[:1], overloaded=True) == pytest.approx(0.15)
 
 
 def test_answers_of_long_ago_and_robots_that_left_do_not_count() -> None:
