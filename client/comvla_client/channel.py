@@ -8,6 +8,7 @@ import grpc
 
 from comvla import codec
 from comvla.errors import HandshakeError
+from comvla.load_hints import LoadHints
 from comvla_client.errors import TransportError
 from comvla_client.locked_out import locked_out
 
@@ -99,7 +100,8 @@ class Attempts:
 def transport_error(error: grpc.RpcError) -> TransportError:
     """A failed call in this package's words."""
     code, details = error.code(), error.details()
-    return TransportError(code.name, details or "no details")
+    hints = LoadHints.from_metadata(error.trailing_metadata())
+    return TransportError(code.name, details or "no details", hints)
 
 
 def is_silence(error: TransportError) -> bool:

@@ -20,6 +20,7 @@ from comvla import codec, handshake
 from comvla.errors import HandshakeError
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
+from comvla_client.advice import BackOff, TokenAdvice
 from comvla_client.agreement import check_model
 from comvla_client.answers import fallback_reason, read_actions
 from comvla_client.budget import PAPER_LINK, LinkProfile
@@ -54,6 +55,7 @@ class Prepared:
         plan: what the policy of sending decided.
         uplink: what is sent; None when nothing is.
         stream: the payload in pieces; ``request`` then has none. None where it goes whole.
+        reason: why nothing is sent, where nothing is.
     """
 
     request: InferRequest | None
@@ -63,6 +65,7 @@ class Prepared:
     plan: Plan
     uplink: Uplink | None = None
     stream: PayloadStream | None = None
+    reason: FallbackReason = "no_link"
 
     def remaining_s(self) -> float:
         """Seconds left for the call; negative when the edge half alone took too long."""
@@ -178,9 +181,15 @@ class ClientCore:
         request = self._blank_request(instruction, checked.proprio.tolist(), reading)
         plan = self._plan(reading, request)
         report = self._opened(reading, request, plan)
+        plan = self._as_advised(plan)
         deadline = started + self.deadline_s - min(WIND_UP_S, 0.1 * self.deadline_s)
         rng = np.random.default_rng([self._seed, self._episode, self._step])
         self._step += 1
+        pause_s = self._back_off.remaining_s
+        if plan.count and pause_s > 0.0:
+            words = f"the server is busy: asking again in {pause_s:.3f} s at the earliest"
+            plan = replace(plan, count=0, detail=words)
+            return Prepared(None, report, started, deadline, plan, reason="overloaded")
         if plan.count == 0:
             if not self._form.in_pieces:
                 plan = replace(plan, detail="the link carries too few bytes for any picture")
@@ -247,6 +256,8 @@ class ClientCore:
             return self.fail(prepared, error, call_s)
         self.queue.accept(actions)
         self._form.settle(prepared.request.step, True)
+        self._back_off.answered()
+        self._advice.hear(response.load.suggested_tokens)
         timings = response.timings
         report = replace(
             self._closed(prepared, call_s, response.tokens_used),
@@ -285,7 +296,11 @@ class ClientCore:
         """
         if prepared.request is not None:
             self._form.settle(prepared.request.step, False)
-        reason: FallbackReason = "no_link" if error is None else fallback_reason(error)
+        reason = prepared.reason if error is None else fallback_reason(error)
+        if error is not None:
+            self._advice.hear(error.hints.suggested_tokens)
+            if reason == "overloaded":
+                self._back_off.refused(error.hints.retry_after_s)
         detail = prepared.plan.detail if error is None else error.message
         actions, planned, source = self.queue.fall_back(hold=prepared.plan.hold)
         report = replace(
@@ -333,6 +348,14 @@ class ClientCore:
             )
         )
 
+    def _as_advised(self, plan: Plan) -> Plan:
+        """No more tokens than a busy server asked for, but what the policy of sending finds useful."""
+        bound = self._advice.most_tokens
+        if bound is None or not self._form.in_pieces or self._form.sizer.sends_all:
+            return plan
+        bound = max(bound, plan.min_tokens)
+        return replace(plan, count=min(plan.count, bound), expected=min(plan.expected, bound))
+
     def _opened(self, reading: SnrReading | None, request: InferRequest, plan: Plan) -> StepReport:
         report = StepReport(
             session=self.session,
@@ -340,6 +363,7 @@ class ClientCore:
             uplink=self._form.name,
             policy=self.sending.name,
             token_budget=plan.budget,
+            advised_tokens=self._advice.most_tokens,
             window_s=self._window_s(plan),
         )
         if reading is None:
@@ -412,6 +436,8 @@ class ClientCore:
             arrived_bits = 8.0 * self._payload_bytes(arrived)
         else:  # pictures arrive whole or not at all
             arrived_bits = 8.0 * report.payload_bytes if arrived else 0.0
+        if prepared.reason == "overloaded":
+            return report  # nothing was tried, so nothing is known of the link
         self.sending.learn(
             Outcome(
                 offered_tokens=offered,
@@ -436,6 +462,8 @@ class ClientCore:
         self.deadline_s = _check_deadline(
             self.queue.execute * info.control_period_s if deadline_s is None else deadline_s
         )
+        self._advice = TokenAdvice(info.num_tokens)
+        self._back_off = BackOff(self.queue.execute * info.control_period_s)
         self._form.start(Setup(info, self._edge, *self._options))
 
     def _read_snr(self, snr: float | SnrReading | None) -> SnrReading | None:

@@ -1,6 +1,7 @@
 """Errors that only a client can have; those of the contract live in :mod:`comvla.errors`."""
 
 from comvla.errors import ComVLAError
+from comvla.load_hints import LoadHints
 
 
 class ClientClosedError(ComVLAError, RuntimeError):
@@ -17,9 +18,11 @@ class TransportError(ComVLAError):
     Attributes:
         code: name of the gRPC status, e.g. ``"UNAVAILABLE"``.
         message: what the server or the channel said.
+        hints: what a busy server wishes.
     """
 
-    def __init__(self, code: str, message: str) -> None:
+    def __init__(self, code: str, message: str, hints: LoadHints | None = None) -> None:
         super().__init__(f"{code}: {message}")
         self.code = code
         self.message = message
+        self.hints = hints or LoadHints()

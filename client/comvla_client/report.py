@@ -55,6 +55,7 @@ class StepReport:
         policy: name of the policy of sending.
         token_budget: what that policy allowed, before it is clipped to the N tokens there are; bytes
             where pictures are sent.
+        advised_tokens: the most that a busy server asked for lately; None where it has no such wish.
         paper_budget: K* of Eq. (4) at that SNR; None without an SNR, or for pictures.
         framed_budget: the same by all bytes that cross the wire; None as above.
         window_s: seconds that the payload had to cross.
@@ -85,6 +86,7 @@ class StepReport:
     capacity_bits: float | None = None
     policy: str = "paper"
     token_budget: int = 0
+    advised_tokens: int | None = None
     paper_budget: int | None = None
     framed_budget: int | None = None
     window_s: float = 0.0

@@ -190,6 +190,19 @@ DASHBOARDS: dict[str, tuple[str, list[Panel]]] = {
                     ("comvla_inference_utilization_ratio{{S}}", "busy {{instance}}"),
                 ],
             ),
+            Panel(
+                "Asked for",
+                "percentunit",
+                [("comvla_offered_load_ratio{{S}}", "{{instance}}")],
+                "Work that robots ask for, turned away or not, as a share of what full batches can do. "
+                "Steadily above 100 %: add a replica.",
+            ),
+            Panel(
+                "Advised tokens",
+                "none",
+                [("comvla_suggested_tokens{{S}}", "{{instance}}")],
+                "What a crowded server asks of each robot; 0: as many as the link carries.",
+            ),
             Panel("Memory", "bytes", [("process_resident_memory_bytes{{S}}", "{{instance}}")]),
             Panel(
                 "Open files",

@@ -23,7 +23,7 @@ from comvla_server.log_throttle import LogThrottle
 from comvla_server.metrics import Metrics
 from comvla_server.rate_limits import RateLimits
 from comvla_server.refusals import Reason, Refusal
-from comvla_server.service import STATUS
+from comvla_server.service import STATUS, hints
 from comvla_server.settings import ServerSettings
 from comvla_server.wording import shown
 
@@ -40,8 +40,11 @@ else:
         return await asyncio.wait_for(message, timeout_s)
 
 
+_MOST_METHODS = 256
+
 _Context = Any  # grpc.aio.ServicerContext
 _HEALTH = f"/{health.SERVICE_NAME}/"
+_INFER = "/comvla.v1.PolicyService/Infer"  # and InferProgressive
 
 # Of the calls that may be open, the share left to health checks, which need no token: strangers who
 # watch the server's health must not keep robots out.
@@ -59,6 +62,10 @@ class Door(grpc.aio.ServerInterceptor):
         limits: what each may send.
         settings: how long to wait for a request, and how many calls may be open.
         metrics: where refusals are counted.
+
+    Attributes:
+        glance: asked before a call for actions is looked at, with the seconds that it has: a refusal where it would
+            be read in vain.
     """
 
     def __init__(
@@ -75,6 +82,8 @@ class Door(grpc.aio.ServerInterceptor):
         self._health_calls = 0
         self._metrics = metrics
         self._throttle = LogThrottle(time.monotonic)
+        self._guards: dict[str, tuple[Any, Any]] = {}
+        self.glance: Callable[[float | None], Refusal | None] = lambda time_remaining_s: None
 
     async def intercept_service(
         self,
@@ -85,7 +94,14 @@ class Door(grpc.aio.ServerInterceptor):
         handler = await continuation(handler_call_details)
         if handler is None:
             return None
-        return self._guarded(handler, handler_call_details.method)
+        # The same for all calls of a method, unless somebody makes handlers anew for each.
+        method = handler_call_details.method
+        behind, guarded = self._guards.get(method, (None, None))
+        if behind is not handler:
+            guarded = self._guarded(handler, method)
+            if len(self._guards) < _MOST_METHODS:
+                self._guards[method] = handler, guarded
+        return guarded
 
     def _guarded(self, handler: Any, method: str) -> Any:
         # On the wire a unary request is a stream of one message. Taken as a stream, the call reaches
@@ -206,11 +222,16 @@ class _Entry:
     def __init__(self, door: Door, method: str, streams: bool, parse: Any) -> None:
         self._door = door
         self._method = method
+        self._for_actions = method.startswith(_INFER)
         self._streams = streams
         self._parse = parse or (lambda message: message)
 
     async def admit(self, requests: AsyncIterator[bytes], context: _Context) -> Any:
         """The request, or the stream of them, of a call that may come in."""
+        if self._for_actions:
+            refusal = self._door.glance(context.time_remaining())
+            if refusal is not None:
+                await self.refuse(refusal, context)
         try:
             identity = self._door.begin(self._method, context)
             messages = aiter(requests)
@@ -232,4 +253,4 @@ class _Entry:
     async def refuse(self, refusal: Refusal, context: _Context) -> Any:
         """Ends a call that may not go on."""
         self._door.note(refusal, self._method, context.peer())
-        await context.abort(STATUS[refusal.reason], refusal.message)
+        await context.abort(STATUS[refusal.reason], refusal.message, hints(refusal))

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from comvla import handshake
 from comvla.errors import HandshakeError
 from comvla.model_info import ModelInfo
+from comvla_server.calibration import calibrate
+from comvla_server.cost_model import CostModel
 from comvla_server.vision import Vision
 from comvla_vla.request import AnyRequest, ImageRequest, PolicyRequest
 
@@ -49,6 +51,7 @@ class Engine:
     Attributes:
         info: description of the model.
         vision: as given.
+        costs: what forward passes take, learned from the warm-up on.
 
     Raises:
         HandshakeError: vision and cloud half are of different models.
@@ -58,6 +61,7 @@ class Engine:
         self._cloud = cloud
         self.info = cloud.info
         self.vision = vision
+        self.costs = CostModel()
         if vision is not None:
             difference = handshake.mismatch(vision.info, cloud.info)
             if difference is not None:
@@ -126,12 +130,13 @@ class Engine:
         """Runs the model once alone and once at the largest batch, so that no robot waits for it.
 
         Observations are unpruned, so this is also the memory peak: a GPU that cannot hold it fails
-        here, before the server says that it is ready.
+        here, before the server says that it is ready. Then a few passes teach it what they cost.
         """
         for size in sorted({1, max_batch}):
             self.predict([self.blank_request(self.info.num_tokens)] * size)
             if self.vision is not None:
                 self.predict([self._blank_pictures()] * size)
+        calibrate(self, max_batch, self.costs)
 
     def _seen(self, request: AnyRequest) -> PolicyRequest:
         """All tokens of a request's pictures; one that brings tokens as it is."""

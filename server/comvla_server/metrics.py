@@ -17,7 +17,13 @@ SNR_BUCKETS = (-10, -5, 0, 2.5, 5, 7.5, 10, 12.5, 15, 17.5, 20, 25, 30, 40)
 TOKEN_BUCKETS = (1, 4, 8, 16, 32, 48, 64, 96, 128, 256, 512)
 BATCH_BUCKETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
-DOOR_REASONS = (Reason.NO_IDENTITY, Reason.RATE, Reason.OVERSIZE, Reason.SLOW)
+DOOR_REASONS = (
+    Reason.NO_IDENTITY,
+    Reason.RATE,
+    Reason.OVERSIZE,
+    Reason.SLOW,
+    Reason.CONGESTED,
+)
 """Why a call can be turned away before it reaches a service."""
 
 
@@ -81,6 +87,11 @@ class Metrics:
             buckets=SECONDS_BUCKETS,
             registry=self.registry,
         )
+        self.predicted_wait = self._histogram(
+            "comvla_predicted_wait_seconds",
+            "Time until its answer that was predicted when a request was let in, margins included.",
+            SECONDS_BUCKETS,
+        )
         self.requests_dropped = Counter(
             "comvla_requests_dropped",
             "Infer and InferProgressive calls that ended without actions, by reason.",
@@ -138,6 +149,16 @@ class Metrics:
             "Busy share of the inference thread over the last seconds.",
             registry=self.registry,
         )
+        self._offered_load = Gauge(
+            "comvla_offered_load_ratio",
+            "Work that robots ask for, turned away or not, as a share of what full batches can do.",
+            registry=self.registry,
+        )
+        self._suggested_tokens = Gauge(
+            "comvla_suggested_tokens",
+            "Tokens that robots are advised to send at most, 0 for as many as they like.",
+            registry=self.registry,
+        )
         self._in_flight = Gauge(
             "comvla_bytes_in_flight",
             "Bytes that open calls hold, as messages and as decoded tokens.",
@@ -162,8 +183,12 @@ class Metrics:
         queue_depth: Callable[[], float],
         utilization: Callable[[], float],
         sessions: Callable[[], float],
+        offered_load: Callable[[], float],
+        suggested_tokens: Callable[[], float],
     ) -> None:
         """Reads these gauges from their owners at every scrape."""
+        self._offered_load.set_function(offered_load)
+        self._suggested_tokens.set_function(suggested_tokens)
         self._queue_depth.set_function(queue_depth)
         self._utilization.set_function(utilization)
         self._sessions.set_function(sessions)

@@ -32,6 +32,11 @@ class Pass:
     flops: float
     predict_s: float
 
+    @property
+    def ok(self) -> bool:
+        """Whether there are actions."""
+        return not isinstance(self.result, Exception)
+
 
 def run_pass(
     engine: Engine,

@@ -103,6 +103,7 @@ class RateLimits:
                 Reason.RATE,
                 f"{shown(identity.name)} may make {account.requests.rate:g} calls per second and "
                 f"made more: retry in {wait_s:.2f} s, or ask for a higher limit",
+                retry_after_s=wait_s,
             )
         account.requests.take(1)
         account.open_calls += 1
@@ -135,6 +136,7 @@ class RateLimits:
                 Reason.RATE,
                 f"{shown(identity.name)} may send {account.size.rate:g} bytes per second and sent "
                 f"more: retry in {wait_s:.2f} s, send fewer tokens, or ask for a higher limit",
+                retry_after_s=wait_s,
             )
         account.size.take(size_bytes)
 

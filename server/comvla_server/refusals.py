@@ -17,6 +17,9 @@ class Reason(str, Enum):
     MISMATCH = "mismatch"  # another model or another protocol
     OVERSIZE = "oversize"  # message larger than the cap
     OVERLOAD = "overload"  # queue full, or too many bytes in flight
+    PREDICTED_LATE = "predicted_late"  # it, or one let in before, could not be answered in time
+    CONGESTED = "congested"  # like predicted_late, told before the request was read
+    FAIR_SHARE = "fair_share"  # too much is asked for, and this robot got more than others
     SHORT = "short"  # too few tokens of a payload in pieces arrived within its window
     KEY_FRAME = "key_frame"  # a picture that builds on one which is not held here
     SUPERSEDED = "superseded"  # a newer observation of the session came
@@ -37,9 +40,13 @@ class Refusal(ComVLAError):
     Attributes:
         reason: the cause.
         message: one line that names what was expected, what came, and the remedy.
+        retry_after_s: when to come back, seconds; None where waiting mends nothing that is known.
+        suggested_tokens: as in the load hint of an answer, 0 for no wish.
     """
 
-    def __init__(self, reason: Reason, message: str) -> None:
+    def __init__(self, reason: Reason, message: str, *, retry_after_s: float | None = None) -> None:
         self.reason = reason
+        self.retry_after_s = retry_after_s
+        self.suggested_tokens = 0
         self.message = one_line(message)
         super().__init__(self.message)

@@ -20,6 +20,7 @@ from comvla_server.engine import Engine
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
 from comvla_server.inference_thread import InferenceThread
 from comvla_server.lifecycle import Lifecycle, Phase
+from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
 from comvla_server.ports import add_grpc_port, authority, listen
 from comvla_server.service import PolicyService, Runtime
@@ -66,7 +67,7 @@ class Server:
         self._grpc: grpc.aio.Server | None = None
         self._admin: AdminHttp | None = None
         self._access: Access | None = None
-        self._watching: asyncio.Task[None] | None = None
+        self._watching: list[asyncio.Task[None]] = []
         self._thread: InferenceThread | None = None
         self._decode_thread: InferenceThread | None = None
 
@@ -106,6 +107,7 @@ class Server:
         access = Access(settings, self.metrics)
         server = make_grpc_server(settings, [access.door])
         service = PolicyService(self.lifecycle, self.metrics, settings)
+        access.door.glance = service.glance
         add_policy_service(server, service)
         await self._health.register(server)
         admin_socket = listen(settings.admin_address, settings.admin_port, "--admin-port")
@@ -124,7 +126,10 @@ class Server:
         self._admin.start()
         await server.start()
         self._access = access
-        self._watching = asyncio.create_task(access.watch())
+        self._watching = [
+            asyncio.create_task(access.watch()),
+            asyncio.create_task(service.loop_watch.run()),
+        ]
 
     async def make_ready(self) -> ModelInfo:
         """Loads and warms up in the inference thread, then says SERVING.
@@ -152,6 +157,7 @@ class Server:
             max_queue=settings.max_queue,
             max_sessions=settings.max_sessions,
             session_ttl_s=settings.session_ttl_s,
+            load=LoadPolicy.of(settings),
             metrics=self.metrics,
             thread=thread,
         )
@@ -161,6 +167,8 @@ class Server:
             queue_depth=lambda: batcher.queue_depth,
             utilization=lambda: batcher.utilization,
             sessions=lambda: len(batcher.sessions),
+            offered_load=lambda: batcher.offered_load,
+            suggested_tokens=lambda: batcher.suggested_tokens,
         )
         validator = Validator(engine, settings.max_request_bytes)
         self._decode_thread = InferenceThread("comvla-decode")
@@ -192,8 +200,8 @@ class Server:
             await self._grpc.stop(_FLUSH_S)
         if self._admin is not None:
             await self._admin.stop()
-        if self._watching is not None:
-            self._watching.cancel()
+        for task in self._watching:
+            task.cancel()
         if self._thread is not None:
             self._thread.close(timeout_s=1.0 if finished else 0.0)
         if self._decode_thread is not None:

@@ -14,12 +14,14 @@ import grpc
 from comvla import codec, handshake
 from comvla.errors import CodecError
 from comvla.images import MAX_VIEW_PIXELS, picture_bytes
+from comvla.load_hints import LoadHints
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.accounts import Answered, CallAccounts
 from comvla_server.batcher import Batcher
 from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle
+from comvla_server.loop_watch import LoopWatch
 from comvla_server.memory import BytesInFlight, Lease
 from comvla_server.metrics import Metrics
 from comvla_server.piecewise import PieceReader
@@ -37,6 +39,9 @@ STATUS = {
     Reason.MISMATCH: grpc.StatusCode.FAILED_PRECONDITION,
     Reason.OVERSIZE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.OVERLOAD: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Reason.PREDICTED_LATE: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Reason.CONGESTED: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Reason.FAIR_SHARE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.SHORT: grpc.StatusCode.DEADLINE_EXCEEDED,
     Reason.KEY_FRAME: grpc.StatusCode.ABORTED,
     Reason.SUPERSEDED: grpc.StatusCode.ABORTED,
@@ -50,6 +55,11 @@ STATUS = {
     Reason.RATE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.SLOW: grpc.StatusCode.DEADLINE_EXCEEDED,
 }
+
+
+def hints(refusal: Refusal) -> tuple[tuple[str, str], ...]:
+    """Trailing metadata of a refusal: what the robot may do about it."""
+    return LoadHints(refusal.retry_after_s, refusal.suggested_tokens).to_metadata()
 
 
 @dataclass(frozen=True)
@@ -73,6 +83,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
     Attributes:
         runtime: the loaded model behind its queue, None while loading.
+        loop_watch: whether the event loop keeps up; runs where its ``run`` does.
     """
 
     def __init__(
@@ -87,6 +98,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         self._metrics = metrics
         self._settings = settings
         self._clock = clock
+        self.loop_watch = LoopWatch()
         self._accounts = CallAccounts(metrics, settings.default_deadline_s, clock)
         self._in_flight = BytesInFlight(settings.max_bytes_in_flight)
         metrics.watch_bytes(lambda: self._in_flight.held)
@@ -114,6 +126,19 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             run_options=runtime.engine.run_options,
         )
 
+    def glance(self, time_remaining_s: float | None) -> Refusal | None:
+        """Whether a call that nobody has read yet can be answered in time; None where it may be.
+
+        Only where the event loop hardly keeps up: to read a request takes longer than to turn it away, and what is
+        turned away unread cannot be known for a repeat or for the newest observation of a robot that waits.
+
+        Args:
+            time_remaining_s: seconds until the caller gives up, None where it did not say.
+        """
+        if self.runtime is None or not self.loop_watch.congested or time_remaining_s is None:
+            return None
+        return self.runtime.batcher.glance(self._clock() + time_remaining_s)
+
     async def Infer(
         self, request: policy_pb2.InferRequest, context: grpc.aio.ServicerContext[Any, Any]
     ) -> policy_pb2.InferResponse:
@@ -121,7 +146,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         try:
             return await self.infer(request, context.time_remaining())
         except Refusal as refusal:
-            await context.abort(STATUS[refusal.reason], refusal.message)
+            await context.abort(STATUS[refusal.reason], refusal.message, hints(refusal))
 
     async def InferProgressive(
         self, messages: AsyncIterator[Any], context: grpc.aio.ServicerContext[Any, Any]
@@ -130,7 +155,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         try:
             response = await self.infer_progressive(messages, context.time_remaining())
         except Refusal as refusal:
-            await context.abort(STATUS[refusal.reason], refusal.message)
+            await context.abort(STATUS[refusal.reason], refusal.message, hints(refusal))
         return policy_pb2.InferProgressiveResponse(response=response)
 
     async def infer(
@@ -244,9 +269,14 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 "was left; allow more time or send fewer tokens",
             )
         runtime.validator.check_identity(request)
+        batcher = runtime.batcher
+        pictures = request.HasField("images")
+        most = runtime.engine.info.num_tokens
+        tokens = most if pictures else min(most, _announced_tokens(request.payload))
+        if tokens:  # else it is no observation, and will be told so
+            batcher.screen(request.session_id, request.step, tokens, deadline_s, pictures=pictures)
         if digest is None:
             digest = content_digest(request)
-        batcher = runtime.batcher
         ticket = batcher.find(request.session_id, request.step, digest)
         decode_s = 0.0
         policy_request: AnyRequest | None = None
@@ -264,7 +294,9 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             assert policy_request is not None
             if request.HasField("snr_db"):
                 self._metrics.reported_snr_db.observe(request.snr_db)
-            ticket = batcher.admit(request.session_id, request.step, policy_request, digest)
+            ticket = batcher.admit(
+                request.session_id, request.step, policy_request, digest, deadline_s
+            )
         answer = await batcher.wait(ticket, deadline_s)
         response = self._response(request, runtime, answer)
         response.timings.decode_s = decode_s
@@ -297,7 +329,9 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             batch_size=answer.batch_size,
             cloud_flops=answer.cloud_flops,
             load=policy_pb2.LoadHint(
-                queue_depth=runtime.batcher.queue_depth, utilization=runtime.batcher.utilization
+                queue_depth=runtime.batcher.queue_depth,
+                utilization=runtime.batcher.utilization,
+                suggested_tokens=runtime.batcher.suggested_tokens,
             ),
             model_fingerprint=runtime.engine.info.fingerprint,
         )
@@ -325,6 +359,15 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         metrics.request_tokens.observe(tokens)
         paper_bytes = codec.payload_bytes(tokens, header.token_dim, header.quantization)
         metrics.tx_payload_bytes.inc(paper_bytes)
+
+
+def _announced_tokens(payload: bytes) -> int:
+    """Tokens that a payload holds, by its header; 0 where it is no payload."""
+    try:
+        header = codec.read_header(payload)
+    except CodecError:
+        return 0
+    return _whole_tokens(header, len(payload))
 
 
 def _whole_tokens(header: codec.PayloadHeader, length: int) -> int:

@@ -12,6 +12,7 @@ __all__ = ["ServerSettings", "SettingsError"]
 
 MODEL, NETWORK, TLS = "model", "network", "encryption"
 ACCESS, LIMITS, CONNECTIONS = "who may call", "limits", "connections"
+OVERLOAD = "when more is asked than can be answered"
 LOGS = "logs, on stderr"
 
 
@@ -188,6 +189,34 @@ class ServerSettings:
         5.0, "deadline of calls that bring none", LIMITS, above_zero=True
     )
     grace_s: float = setting(10.0, "time that calls in flight get when the server stops", LIMITS)
+
+    admission: bool = setting(
+        True, "turn away at the door what cannot be answered by its deadline", OVERLOAD
+    )
+    fair_shares: bool = setting(
+        True,
+        "under overload turn away first the robots that got more answers lately than the others",
+        OVERLOAD,
+    )
+    earliest_deadline_first: bool = setting(
+        True, "compute in the order of deadlines instead of arrival", OVERLOAD
+    )
+    deadline_margin_s: float = setting(
+        0.005, "how long before its deadline an answer has to be ready, to arrive in time", OVERLOAD
+    )
+    advise_tokens: bool = setting(
+        True, "tell robots how many tokens the server can take from each of them", OVERLOAD
+    )
+    advise_least_tokens: int = setting(
+        20, "never advise fewer tokens than this", OVERLOAD, low=1, hint="policies fail on too few"
+    )
+    advise_target_load: float = setting(
+        0.8,
+        "share of its capacity that the server wants to be asked for",
+        OVERLOAD,
+        above_zero=True,
+        unit="its capacity",
+    )
 
     max_connections: int = setting(
         1024,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from comvla_server.cost_model import Work
 from comvla_server.refusals import Refusal
 from comvla_vla.request import AnyRequest
 
@@ -23,6 +24,7 @@ class Answer:
         cloud_flops: multiply-adds counted twice, this request's share.
         queue_s: seconds between admission and the start of the forward pass.
         predict_s: seconds of the forward pass.
+        ready_s: monotonic time when it was there.
     """
 
     actions: NDArray[np.float32]
@@ -31,9 +33,28 @@ class Answer:
     cloud_flops: float
     queue_s: float
     predict_s: float
+    ready_s: float
 
 
 Outcome = Answer | Refusal
+
+
+@dataclass(eq=False)
+class Place:
+    """A request as the queue sees it, whatever is in it.
+
+    Attributes:
+        robot: who asks: its identity where the server knows it, else its session.
+        work: what it adds to a forward pass.
+        deadline_s: monotonic time after which nobody waits any more.
+        due_s: monotonic time by which the place is due: the deadline, or that of the older
+            observation whose place it took.
+    """
+
+    robot: str
+    work: Work
+    deadline_s: float
+    due_s: float
 
 
 @dataclass(eq=False)
@@ -44,8 +65,8 @@ class Ticket:
         session_id, step: identity of the request.
         digest: fingerprint of the request's content.
         request: what the model needs, or None once the outcome is there.
+        place: where it stands; its deadline is the latest of all callers.
         admitted_s: monotonic time of admission.
-        deadline_s: monotonic time after which nobody waits any more (the latest of all callers).
         callers: calls that wait for the outcome right now.
         outcome: an answer or a refusal; never an exception, so that none goes unretrieved.
     """
@@ -54,9 +75,9 @@ class Ticket:
     step: int
     digest: bytes
     request: AnyRequest | None
+    place: Place
     admitted_s: float
     outcome: asyncio.Future[Outcome]
-    deadline_s: float = 0.0
     callers: int = field(default=0)
 
     def resolve(self, outcome: Outcome) -> None:

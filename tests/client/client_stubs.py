@@ -15,6 +15,7 @@ import numpy as np
 
 from comvla import codec, handshake
 from comvla.errors import InstructionError
+from comvla.load_hints import LoadHints
 from comvla.model_info import ModelInfo
 from comvla.v1 import policy_pb2_grpc
 from comvla.v1.policy_pb2 import (
@@ -111,7 +112,9 @@ def chunk_of(request: InferRequest, info: ModelInfo = INFO) -> np.ndarray:
     return actions
 
 
-def answer(request: InferRequest, info: ModelInfo = INFO) -> InferResponse:
+def answer(
+    request: InferRequest, info: ModelInfo = INFO, suggested_tokens: int = 0
+) -> InferResponse:
     """A well-formed response to ``request``."""
     _, positions = codec.decode(request.payload)
     return InferResponse(
@@ -124,7 +127,7 @@ def answer(request: InferRequest, info: ModelInfo = INFO) -> InferResponse:
         batch_size=3,
         cloud_flops=5e9,
         timings=ServerTimings(decode_s=0.001, queue_s=0.002, predict_s=0.003, total_s=0.006),
-        load=LoadHint(queue_depth=1, utilization=0.5, suggested_tokens=16),
+        load=LoadHint(queue_depth=1, utilization=0.5, suggested_tokens=suggested_tokens),
         model_fingerprint=info.fingerprint,
     )
 
@@ -176,9 +179,11 @@ class AsyncStubTransport:
         self.inner.close()
 
 
-def fault(code: str, message: str = "as scripted") -> TransportError:
+def fault(
+    code: str, message: str = "as scripted", hints: LoadHints | None = None
+) -> TransportError:
     """A failed call."""
-    return TransportError(code, message)
+    return TransportError(code, message, hints)
 
 
 class StubService(policy_pb2_grpc.PolicyServiceServicer):

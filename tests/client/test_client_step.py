@@ -97,7 +97,7 @@ def test_the_report_accounts_for_bytes_time_and_operations() -> None:
     assert report.batch_size == 3
     assert (report.edge_flops, report.cloud_flops) == (1004.0, 5e9)
     assert report.load is not None
-    assert (report.load.queue_depth, report.load.suggested_tokens) == (1, 16)
+    assert (report.load.queue_depth, report.load.suggested_tokens) == (1, 0)
 
 
 def test_the_report_is_json() -> None:
@@ -248,8 +248,7 @@ def test_too_few_tokens_are_not_worth_sending() -> None:
 
 FALLBACKS = {
     "UNAVAILABLE": "unavailable",
-    "DEADLINE_EXCEEDED": "deadline",
-    "RESOURCE_EXHAUSTED": "overloaded",
+    "DEADLINE_EXCEEDED": "deadline",  # RESOURCE_EXHAUSTED makes it pause: test_advice.py
     "ABORTED": "rejected",
     "UNAUTHENTICATED": "unauthorized",
     "PERMISSION_DENIED": "unauthorized",

@@ -14,8 +14,10 @@ import pytest_asyncio
 from server_stubs import PATIENCE_S, StubCloud, policy_request, stub_actions
 
 from comvla_server.batcher import Batcher
+from comvla_server.cost_model import CostModel, Work
 from comvla_server.engine import Engine
 from comvla_server.inference_thread import InferenceThread
+from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.tickets import Answer
@@ -408,3 +410,125 @@ async def test_gaps_between_answered_steps_are_steps_that_a_robot_bridged(
     await ask(batcher, "b", 3)
     await ask(batcher, "b", 3)
     assert metrics.registry.get_sample_value("comvla_unanswered_steps_total") == 4
+
+
+async def test_the_earliest_deadline_is_computed_first(make: MakeBatcher, cloud: StubCloud) -> None:
+    batcher = make(max_batch=1)
+    first = await occupy(batcher, cloud)
+    later = ask(batcher, "later", name=1.0, deadline_s=soon() + 20)
+    await queued(batcher, 1)
+    sooner = ask(batcher, "sooner", name=2.0, deadline_s=soon() + 10)
+    await queued(batcher, 2)
+    cloud.release()
+    await asyncio.gather(first, later, sooner)
+    assert cloud.batches == [[-1.0], [2.0], [1.0]]
+
+
+async def test_in_order_of_arrival_where_deadlines_shall_not_count(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    batcher = make(max_batch=1, load=LoadPolicy(earliest_deadline_first=False))
+    first = await occupy(batcher, cloud)
+    later = ask(batcher, "later", name=1.0, deadline_s=soon() + 20)
+    await queued(batcher, 1)
+    sooner = ask(batcher, "sooner", name=2.0, deadline_s=soon() + 10)
+    await queued(batcher, 2)
+    cloud.release()
+    await asyncio.gather(first, later, sooner)
+    assert cloud.batches == [[-1.0], [1.0], [2.0]]
+
+
+async def test_asking_anew_does_not_cost_a_robot_its_turn(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    batcher = make(max_batch=1)
+    first = await occupy(batcher, cloud)
+    older = ask(batcher, "eager", 0, name=1.0, deadline_s=soon() + 10)
+    await queued(batcher, 1)
+    other = ask(batcher, "other", 0, name=2.0, deadline_s=soon() + 20)
+    await queued(batcher, 2)
+    newer = ask(batcher, "eager", 1, name=3.0, deadline_s=soon() + 30)
+    assert (await refusal(older)).reason is Reason.SUPERSEDED
+    cloud.release()
+    await asyncio.gather(first, other, newer)
+    assert cloud.batches == [[-1.0], [3.0], [2.0]]
+
+
+def known(seconds: float) -> CostModel:
+    """Costs of a model whose passes all take so long."""
+    costs = CostModel()
+    for b, k in ((1, 3), (2, 6), (2, 12), (1, 9)) * 3:
+        costs.observe(Work(b, k), seconds)
+    return costs
+
+
+async def held(make: MakeBatcher, cloud: StubCloud, clock: Clock, **options: Any) -> Batcher:
+    """A batcher whose model, which takes a second, has begun a pass for session ``first``."""
+    batcher = make(clock=clock, costs=known(1.0), **options)
+    cloud.hold()
+    ask(batcher, "first", name=-1.0, deadline_s=clock() + PATIENCE_S)
+    await asyncio.to_thread(cloud.wait_until_running)
+    return batcher
+
+
+async def test_what_would_be_late_is_turned_away_at_once_and_costs_nothing(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    clock, metrics = Clock(), Metrics()
+    batcher = await held(make, cloud, clock, metrics=metrics)
+    refused = await refusal(ask(batcher, "robot", deadline_s=clock() + 1.5))
+    assert refused.reason is Reason.PREDICTED_LATE
+    assert refused.retry_after_s == pytest.approx(0.5, abs=0.1)
+    assert batcher.queue_depth == 0
+    welcome = ask(batcher, "robot", deadline_s=clock() + 2.5)
+    await queued(batcher, 1)
+    assert metrics.registry.get_sample_value("comvla_predicted_wait_seconds_count") == 2
+    cloud.release()
+    assert isinstance(await welcome, Answer)
+    assert [len(batch) for batch in cloud.batches] == [1, 1]
+
+
+async def test_a_newer_observation_that_would_be_late_leaves_the_older_one_waiting(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    clock = Clock()
+    batcher = await held(make, cloud, clock)
+    older = ask(batcher, "robot", 0, name=1.0, deadline_s=clock() + 2.5)
+    await queued(batcher, 1)
+    refused = await refusal(ask(batcher, "robot", 1, deadline_s=clock() + 0.5))
+    assert refused.reason is Reason.PREDICTED_LATE
+    cloud.release()
+    assert isinstance(await older, Answer)
+
+
+async def test_screening_turns_away_like_admission_and_lets_repeats_pass(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    clock = Clock()
+    batcher = await held(make, cloud, clock)
+    with pytest.raises(Refusal) as caught:
+        batcher.screen("robot", 0, 3, clock() + 0.5, pictures=False)
+    assert caught.value.reason is Reason.PREDICTED_LATE
+    batcher.screen("first", 0, 3, clock() + 0.5, pictures=False)  # it runs
+    batcher.screen("robot", 0, 3, clock() + 5.0, pictures=False)
+    assert batcher.queue_depth == 0
+
+
+async def test_a_glance_tells_whether_a_request_like_the_others_would_be_late(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    clock = Clock()
+    batcher = await held(make, cloud, clock)
+    refused = batcher.glance(clock() + 0.5)
+    assert refused is not None
+    assert refused.reason is Reason.CONGESTED
+    assert batcher.glance(clock() + 5.0) is None
+
+
+async def test_two_batchers_in_one_process_know_nothing_of_each_other(
+    make: MakeBatcher, cloud: StubCloud
+) -> None:
+    one, two = make(), make()
+    await ask(one, "robot", 5)
+    assert isinstance(await ask(two, "robot", 0), Answer)
+    assert (len(one.sessions), len(two.sessions)) == (1, 1)

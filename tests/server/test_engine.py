@@ -68,7 +68,12 @@ def test_warm_up_runs_alone_and_at_the_largest_batch_without_pruning() -> None:
         return usual(requests)
 
     cloud.predict = predict  # type: ignore[method-assign]
-    Engine(cloud).warm_up(max_batch=8)
+    n, engine = STUB_INFO.num_tokens, Engine(cloud)
+    engine.warm_up(max_batch=8)
+    assert sizes[:2] == [(1, n), (8, n)]
+    assert {requests for requests, _ in sizes} == {1, 8}  # what follows teaches it its costs
+    assert engine.costs.known
+    sizes.clear()
     Engine(cloud).warm_up(max_batch=1)
-    n = STUB_INFO.num_tokens
-    assert sizes == [(1, n), (8, n), (1, n)]
+    assert sizes[0] == (1, n)
+    assert {requests for requests, _ in sizes} == {1}

@@ -1,4 +1,4 @@
-"""``comvla-sim bench transport | edge | batching | model | wire | idle``."""
+"""``comvla-sim bench transport | edge | batching | model | wire | idle | overload | soak``."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for name, (text, add_options) in _BENCHES.items():
         bench = benches.add_parser(name, help=text, description=text)
         bench.add_argument("--json", action="store_true", help="print one JSON object")
-        bench.add_argument(
-            "--repetitions", type=whole(1), help="timed calls (default: the bench's own)"
-        )
-        bench.add_argument(
-            "--warm-up", type=whole(0), help="calls before them (default: the bench's own)"
-        )
+        if name not in _BY_THE_CLOCK:
+            bench.add_argument(
+                "--repetitions", type=whole(1), help="timed calls (default: the bench's own)"
+            )
+            bench.add_argument(
+                "--warm-up", type=whole(0), help="calls before them (default: the bench's own)"
+            )
         add_options(bench)
     parser.set_defaults(run=run)
 
@@ -42,9 +43,11 @@ def run(args: argparse.Namespace) -> int:
         "model": _model,
         "wire": _wire,
         "idle": _idle,
+        "overload": _overload,
+        "soak": _soak,
     }[args.bench](args)
     print(json.dumps(result, indent=2) if args.json else _text(result))
-    return 0
+    return 0 if result.get("passed", True) else 1
 
 
 def _transport_options(parser: argparse.ArgumentParser) -> None:
@@ -112,6 +115,47 @@ def _idle_options(parser: argparse.ArgumentParser) -> None:
     _link_options(parser, "26.3, the paper's link at 10 dB")
 
 
+def _fleet_options(parser: argparse.ArgumentParser, model: str, tokens: int) -> None:
+    parser.add_argument("--robots", type=whole(1), help="(64)")
+    parser.add_argument("--k", dest="token_budget", type=whole(1), help=f"tokens ({tokens})")
+    parser.add_argument("--max-batch", type=whole(1), help="of the server (8)")
+    parser.add_argument(
+        "--model",
+        help="stub (a pass takes a fixed time and no processor, which shows the scheduler alone), "
+        f"mini, random or a checkpoint ({model})",
+    )
+    parser.add_argument("--threads", type=whole(0), help="of torch in the server (1)")
+    parser.add_argument("--capacity-s", type=number(0.1), help="in which capacity is measured")
+
+
+def _overload_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--loads",
+        type=lambda text: tuple(number(0.01)(part) for part in text.split(",")),
+        metavar="X,X,…",
+        help="offered, as multiples of the capacity measured (1.5,10)",
+    )
+    _fleet_options(parser, "stub", 128)
+    parser.add_argument(
+        "--cases",
+        type=lambda text: tuple(text.split(",")),
+        metavar="NAME,NAME,…",
+        help="of admission off, admission, advised K and back-off, each with what is before it (all)",
+    )
+    parser.add_argument("--seconds", type=number(0.1), help="of each load (10)")
+    parser.add_argument("--settle-s", type=number(0.0), help="before them, not counted (3)")
+    parser.add_argument(
+        "--deadline-passes", type=number(0.1), help="deadline, in passes of a full batch (4)"
+    )
+
+
+def _soak_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--minutes", type=number(0.01), help="(30)")
+    parser.add_argument("--load", type=number(0.01), help="as a multiple of the capacity (0.8)")
+    _fleet_options(parser, "mini", 32)
+    parser.add_argument("--deadline-s", type=number(0.001), help="of a request (1)")
+
+
 def _link_options(parser: argparse.ArgumentParser, rate: str) -> None:
     parser.add_argument("--delay-ms", type=number(0.0), help="one way (wire: 0, idle: 20)")
     parser.add_argument("--mbit-per-s", type=number(0.001), help=f"rate of the link ({rate})")
@@ -127,7 +171,16 @@ _BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
         "a query after a silence, against one without, remedy by remedy (root)",
         _idle_options,
     ),
+    "overload": (
+        "more robots than a server can answer, with admission off and on, with advised K",
+        _overload_options,
+    ),
+    "soak": (
+        "memory and descriptors of a server under steady load; exit code 1 where they grow",
+        _soak_options,
+    ),
 }
+_BY_THE_CLOCK = {"overload", "soak"}
 
 
 def _transport(args: argparse.Namespace) -> dict[str, Any]:
@@ -167,6 +220,23 @@ def _idle(args: argparse.Namespace) -> dict[str, Any]:
 
     parameters = _given(idle_bench.IdleParameters, args)
     return idle_bench.run(parameters, on_case=lambda name: print(name, file=sys.stderr, flush=True))
+
+
+def _overload(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.bench import overload
+
+    parameters = _given(overload.OverloadParameters, args)
+    return overload.run(parameters, lambda name: print(name, file=sys.stderr, flush=True))
+
+
+def _soak(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.bench import soak
+    from comvla_sim.netlink.command import progress
+
+    parameters = _given(soak.SoakParameters, args)
+    total = round(60.0 * parameters.minutes)
+    with progress("seconds") as show:
+        return soak.run(parameters, lambda seconds: show(min(int(seconds), total), total))
 
 
 def _given(parameters: Callable[..., Any], args: argparse.Namespace) -> Any:

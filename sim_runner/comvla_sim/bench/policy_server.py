@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from multiprocessing.connection import Connection
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import CloudHalf, Engine
 from comvla_server.settings import ServerSettings
 from comvla_sim.bench.processes import announce, wait_for_end
+from comvla_sim.bench.stub_model import StubModel
 from comvla_vla.request import PolicyRequest
 
 NO_MODEL = ModelInfo(
@@ -51,17 +54,24 @@ class NoModel:
         """Accepts every instruction."""
 
 
-def serve(lifeline: Connection, model: str, max_batch: int, threads: int) -> None:
+def serve(
+    lifeline: Connection,
+    model: str,
+    max_batch: int,
+    threads: int,
+    settings: Mapping[str, Any] | None = None,
+) -> None:
     """Serves until the benchmark ends; announces the gRPC address and the admin address.
 
     Args:
         lifeline: to the benchmark.
-        model: ``"none"``, ``"random"``, or what ``comvla_vla.load_cloud`` takes.
+        model: ``"none"``, ``"stub"``, ``"random"``, or what ``comvla_vla.load_cloud`` takes.
         max_batch: most requests in one forward pass.
         threads: of torch, 0 for its own choice.
+        settings: of the server, where they differ from its defaults.
     """
-    settings = ServerSettings(max_batch=max_batch)
-    with BackgroundServer(Engine(_cloud_half(model, threads)), settings) as server:
+    chosen = ServerSettings(max_batch=max_batch, **(settings or {}))
+    with BackgroundServer(Engine(_cloud_half(model, threads)), chosen) as server:
         announce(lifeline, f"{server.target} {server.admin_url}")
         wait_for_end(lifeline)
 
@@ -69,6 +79,8 @@ def serve(lifeline: Connection, model: str, max_batch: int, threads: int) -> Non
 def _cloud_half(model: str, threads: int) -> CloudHalf:
     if model == "none":
         return NoModel()
+    if model == "stub":
+        return StubModel()
     import torch
 
     import comvla_vla

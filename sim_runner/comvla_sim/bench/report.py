@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from comvla_sim.bench.table import milliseconds, render
+from comvla_sim.bench.table import milliseconds, percent, render
 
 _TIMES: dict[str, Callable[[Any], str]] = {
     "median_s": milliseconds,
@@ -16,6 +16,19 @@ _TIMES: dict[str, Callable[[Any], str]] = {
     "p90_s": milliseconds,
     "worst_s": milliseconds,
     "bytes_per_query": lambda value: f"{value:.0f}",
+    "p50_s": milliseconds,
+    "in_time_share": percent,
+    "served_share": percent,
+    "shed_share": percent,
+    "superseded_share": percent,
+    "late_share": percent,
+    "paused_share": percent,
+    "server_cpu": percent,
+    "generator_cpu": percent,
+    "mean_tokens": lambda value: f"{value:.0f}",
+    "offered_per_s": lambda value: f"{value:.0f}",
+    "resident_mib": lambda value: f"{value:.1f}",
+    "descriptors": lambda value: f"{value:.0f}",
 }
 _HEADS = {
     "name": "",
@@ -48,6 +61,23 @@ _HEADS = {
     "captured_bytes": "captured bytes",
     "repeated_bytes": "sent again",
     "repetitions": "calls",
+    "load": "load",
+    "offered_per_s": "asked/s",
+    "goodput_ratio": "goodput x capacity",
+    "in_time_share": "admitted in time %",
+    "jain": "Jain",
+    "served_share": "served in period %",
+    "shed_share": "shed %",
+    "superseded_share": "superseded %",
+    "late_share": "late %",
+    "paused_share": "backed off %",
+    "mean_tokens": "mean K",
+    "p50_s": "median ms",
+    "memory_growth_mib": "memory MiB",
+    "server_cpu": "server CPU %",
+    "generator_cpu": "generator CPU %",
+    "resident_mib": "resident MiB",
+    "descriptors": "descriptors",
 }
 
 
@@ -88,6 +118,10 @@ def _conclusions(result: Mapping[str, Any]) -> list[str]:
         return _model_conclusions(result)
     if result["bench"] == "idle":
         return _idle_conclusions(result)
+    if result["bench"] == "overload":
+        return _overload_conclusions(result)
+    if result["bench"] == "soak":
+        return _soak_conclusions(result)
     return []
 
 
@@ -97,6 +131,32 @@ def _idle_conclusions(result: Mapping[str, Any]) -> list[str]:
         "",
         f"round trip {trip} ms, bytes of a query on this link {wire} ms; allowed: "
         f"{milliseconds(result['allowed_s'])} ms (1.15 round trips and the bytes)",
+    ]
+
+
+def _overload_conclusions(result: Mapping[str, Any]) -> list[str]:
+    first, chosen = result["rows"][0], result["parameters"]
+    stub = " (a stub: a pass takes a fixed time and no processor)"
+    return [
+        "",
+        f"model {chosen['model']}{stub if chosen['model'] == 'stub' else ''}, {chosen['robots']} robots that "
+        f"would send {chosen['token_budget']} tokens, deadline {milliseconds(first['deadline_s'])} ms; capacity "
+        f"{first['capacity_per_s']:.1f} answers/s, measured anew for each server",
+        "goals with admission: "
+        + ", ".join(f"{_HEADS[name]} {_cell(name, goal)}" for name, goal in result["goals"].items())
+        + f": {'met' if result['met'] else 'NOT met'}",
+    ]
+
+
+def _soak_conclusions(result: Mapping[str, Any]) -> list[str]:
+    chosen = result["parameters"]
+    return [
+        "",
+        f"model {chosen['model']}, {chosen['robots']} robots at {chosen['load']:g} of {result['capacity_per_s']:.1f} "
+        f"answers/s for {chosen['minutes']:g} minutes: {result['answered']} answered, "
+        f"{percent(result['answered_share'])} % of what was asked, p99 {milliseconds(result['p99_s'])} ms",
+        f"resident memory after the first sixth: {100 * result['growth']:+.2f} %, descriptors: "
+        f"{result['descriptors_growth']:+.0f}: {'passed' if result['passed'] else 'FAILED'}",
     ]
 
 

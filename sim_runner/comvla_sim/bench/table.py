@@ -20,3 +20,8 @@ def render(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def milliseconds(seconds: float) -> str:
     """Three decimals, so that microseconds stay visible."""
     return f"{seconds * 1e3:.3f}"
+
+
+def percent(share: float) -> str:
+    """A share in percent, with one decimal."""
+    return f"{100.0 * share:.1f}"

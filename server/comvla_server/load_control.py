@@ -1,0 +1,158 @@
+"""Keeps a batcher's promises under overload: measures costs, lets in what fits, advises robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from comvla_server.admission import Admission
+from comvla_server.busy import BusyMeter
+from comvla_server.cost_model import CostModel, Work
+from comvla_server.fairness import FairShares
+from comvla_server.load_policy import LoadPolicy
+from comvla_server.metrics import Metrics
+from comvla_server.offered_load import OfferedLoad
+from comvla_server.refusals import Refusal
+from comvla_server.tickets import Place
+
+# Per answer: the longest lag has lost half its weight after 34 answers.
+_LAG_FADES = 0.98
+# A deadline is in danger where waiting uses up more than this share of its time.
+_DANGER = 0.5
+
+
+class LoadControl:
+    """What one model can do, what it is asked for, and who gets it. Times are monotonic seconds.
+
+    Args:
+        max_batch: requests in a full batch.
+        num_tokens: N.
+        policy: what is switched on.
+        costs: what passes cost, perhaps calibrated already.
+        metrics: where predictions go.
+    """
+
+    def __init__(
+        self,
+        max_batch: int,
+        num_tokens: int,
+        policy: LoadPolicy,
+        costs: CostModel,
+        metrics: Metrics,
+    ) -> None:
+        self._costs = costs
+        self._shares = FairShares()
+        self._offered = OfferedLoad(costs, max_batch, num_tokens, policy)
+        self._admission = Admission(costs, self._shares, policy, max_batch)
+        self._metrics = metrics
+        self._busy = BusyMeter()
+        self._running: tuple[float, float] | None = None
+
+    def order(self, waiting: Sequence[Place]) -> list[Place]:
+        """Who is computed first."""
+        return self._admission.order(waiting)
+
+    def screen(
+        self, place: Place, waiting: Sequence[Place], now_s: float, *, replaces: bool
+    ) -> float:
+        """Predicted seconds until a request's answer; counts nothing but a refusal.
+
+        Args:
+            place: of the new request.
+            waiting: the others, in order of arrival, without one that it replaces.
+            now_s: the time.
+            replaces: it takes the place of an older observation of its session.
+
+        Raises:
+            Refusal: it would be late, make another late, or is above its fair share.
+        """
+        try:
+            return self._admission.require(
+                place,
+                waiting,
+                self.free_s(now_s),
+                now_s,
+                overloaded=self.load(now_s) > 1.0,
+                replaces=replaces,
+            )
+        except Refusal:
+            self._note_asked(place, now_s)
+            self._offered.note_pressure(now_s)
+            raise
+
+    def let_in(
+        self, place: Place, waiting: Sequence[Place], now_s: float, *, replaces: bool
+    ) -> None:
+        """:meth:`screen`, and counts the request where it may come in.
+
+        Raises:
+            Refusal: see :meth:`screen`.
+        """
+        wait_s = self.screen(place, waiting, now_s, replaces=replaces)
+        self._note_asked(place, now_s)
+        if wait_s > _DANGER * (place.deadline_s - now_s):
+            self._offered.note_pressure(now_s)
+        self._metrics.predicted_wait.observe(max(0.0, wait_s))
+        if not replaces:
+            self._shares.credit(place.robot, now_s)
+
+    def note_full(self, now_s: float) -> None:
+        """Somebody was turned away because the queue is full."""
+        self._offered.note_pressure(now_s)
+
+    def note_unanswered(self, place: Place, now_s: float) -> None:
+        """Whoever was let in leaves without an answer."""
+        self._shares.credit(place.robot, now_s, -1.0)
+
+    def begin(self, work: Work, now_s: float) -> None:
+        """A pass starts."""
+        self._busy.begin(now_s)
+        self._running = (now_s, self._costs.predict(work))
+
+    def end(self, work: Work, ready_s: float, now_s: float, *, succeeded: bool) -> None:
+        """A pass ended.
+
+        Args:
+            work: of the pass.
+            ready_s: since when there was this work and no other before it: a pass costs what passes
+                until the next can begin, not only what the model takes.
+            now_s: the time.
+            succeeded: whether it says anything about costs.
+        """
+        self._busy.end(now_s)
+        self._running = None
+        if succeeded:
+            self._costs.observe(work, now_s - ready_s)
+
+    def note_lag(self, lag_s: float) -> None:
+        """How long an answer took from the model to its caller; the longest ones fade slowly."""
+        self._admission.lag_s = max(lag_s, _LAG_FADES * self._admission.lag_s)
+
+    def free_s(self, now_s: float) -> float:
+        """When the model will be done with what it computes now; ``now_s`` where it rests."""
+        if self._running is None:
+            return now_s
+        started_s, predicted_s = self._running
+        elapsed_s = now_s - started_s
+        # What takes longer than expected may take as much longer again.
+        return now_s + max(predicted_s - elapsed_s, elapsed_s - predicted_s, 1e-6)
+
+    def usual_work(self) -> Work:
+        """What requests of late took, on average."""
+        return self._offered.usual_work()
+
+    def utilization(self, now_s: float) -> float:
+        """Busy share of the inference thread over the last seconds, 0 to 1."""
+        return self._busy.utilization(now_s)
+
+    def load(self, now_s: float) -> float:
+        """Work asked for as a share of what the model can do; above 1 is too much."""
+        return self._offered.load(now_s)
+
+    def suggested_tokens(self, now_s: float) -> int:
+        """Tokens that a request should have at most, 0 for no wish."""
+        return self._offered.advice(now_s)
+
+    def _note_asked(self, place: Place, now_s: float) -> None:
+        if place.robot:
+            self._shares.note_asked(place.robot, now_s)
+        self._offered.note(place.work, now_s)

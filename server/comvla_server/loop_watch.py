@@ -1,0 +1,60 @@
+"""Whether an event loop keeps up with what arrives."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+_TICK_S = 0.05
+_MEMORY = 0.7  # of the last value at each tick: half of it is forgotten after 0.1 s
+_BUSY = 0.5
+_LATE_S = 0.005
+
+
+class LoopWatch:
+    """Looks twenty times a second how much processor time the loop's thread takes, and how late it is.
+
+    A loop that works all the time no longer sees how long calls wait for it inside gRPC. It is late where other
+    threads or programs take the processor from it.
+
+    Args:
+        clock: monotonic seconds.
+        processor: seconds that this thread has worked.
+
+    Attributes:
+        busy: share of its time that it works, 0 to 1. late_s: how late it comes to what is due, seconds.
+    """
+
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        processor: Callable[[], float] = time.thread_time,
+    ) -> None:
+        self._clock = clock
+        self._processor = processor
+        self._last: tuple[float, float] | None = None
+        self.busy = 0.0
+        self.late_s = 0.0
+
+    @property
+    def congested(self) -> bool:
+        """Whether calls may be waiting that the loop has not seen yet."""
+        return self.busy > _BUSY or self.late_s > _LATE_S
+
+    async def run(self) -> None:
+        """Looks until it is cancelled; on the loop that is watched."""
+        while True:
+            self.look()
+            await asyncio.sleep(_TICK_S)
+
+    def look(self) -> None:
+        """One look, which ``run`` takes every 50 ms."""
+        now_s, worked_s = self._clock(), self._processor()
+        if self._last is not None:
+            since_s, before_s = now_s - self._last[0], worked_s - self._last[1]
+            busy = min(1.0, before_s / max(since_s, 1e-9))
+            late_s = max(0.0, since_s - _TICK_S)
+            self.busy += (1.0 - _MEMORY) * (busy - self.busy)
+            self.late_s += (1.0 - _MEMORY) * (late_s - self.late_s)
+        self._last = now_s, worked_s

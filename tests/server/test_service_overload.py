@@ -1,0 +1,154 @@
+"""Overload over a real connection: what a robot is told, and where it stands in the metrics."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import grpc
+import numpy as np
+from numpy.typing import NDArray
+from server_stubs import Robot, StubCloud, eventually, message
+
+from comvla.load_hints import LoadHints
+from comvla_server.background import BackgroundServer
+from comvla_server.engine import Engine
+from comvla_server.loop_watch import LoopWatch
+from comvla_server.settings import ServerSettings
+from comvla_vla.request import PolicyRequest
+
+
+def sample(server: BackgroundServer, name: str, **labels: str) -> float:
+    value = server.server.metrics.registry.get_sample_value(f"comvla_{name}", labels)
+    assert value is not None
+    return value
+
+
+def ask(robot: Robot, session: str, timeout_s: float) -> Any:
+    """A call that is over."""
+    call = robot.send(message(session), timeout_s)
+    call.exception()
+    return call
+
+
+def test_what_cannot_be_answered_in_time_is_turned_away_with_a_hint_when_to_retry(
+    server: BackgroundServer, robot: Robot, cloud: StubCloud
+) -> None:
+    cloud.hold()
+    running = robot.send(message("busy", name=-1.0))
+    cloud.wait_until_running()
+    names = (f"robot-{i}" for i in range(1000))
+
+    def turned_away() -> Any:
+        # A pass that already took longer than the deadline will not end within it.
+        call = ask(robot, next(names), timeout_s=0.05)
+        return call if call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED else None
+
+    call = eventually(turned_away)
+    hints = LoadHints.from_metadata(call.trailing_metadata())
+    assert hints.retry_after_s is not None
+    assert 0.0 < hints.retry_after_s < 60.0
+    assert "are predicted for 3 tokens; retry in" in call.details()
+    assert sample(server, "requests_dropped_total", reason="predicted_late") >= 1
+    assert sample(server, "queue_depth") == 0
+    cloud.release()
+    assert running.result()
+    assert {name for batch in cloud.batches for name in batch} == {-1.0}
+
+
+def test_without_admission_requests_wait_for_their_deadline(cloud: StubCloud) -> None:
+    settings = ServerSettings(admission=False)
+    with BackgroundServer(Engine(cloud), settings) as server, Robot(server.target) as robot:
+        cloud.forget()
+        cloud.hold()
+        running = robot.send(message("busy"))
+        cloud.wait_until_running()
+        for i in range(3):
+            assert ask(robot, f"s{i}", 0.05).code() is grpc.StatusCode.DEADLINE_EXCEEDED
+        cloud.release()
+        assert running.result()
+
+
+class SlowByTokens(StubCloud):
+    """A pass takes a millisecond for each token."""
+
+    def _actions(self, requests: list[PolicyRequest]) -> list[NDArray[np.float32]]:
+        time.sleep(0.001 * sum(len(request.positions) for request in requests))
+        return super()._actions(requests)
+
+
+def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics() -> None:
+    cloud, settings = SlowByTokens(), ServerSettings(advise_least_tokens=1, max_batch=2)
+    advised = threading.Event()
+    with BackgroundServer(Engine(cloud), settings) as server:
+
+        def keep_asking(name: str) -> None:
+            with Robot(server.target) as robot:
+                for step in range(1000):
+                    # About three passes: with four robots, deadlines are in danger.
+                    call = robot.send(message(name, step, k=16), timeout_s=0.1)
+                    if call.exception() is None and 0 < call.result().load.suggested_tokens < 16:
+                        advised.set()
+                    if advised.is_set():
+                        return
+
+        threads = [threading.Thread(target=keep_asking, args=(f"r{i}",)) for i in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert advised.is_set()
+        assert sample(server, "offered_load_ratio") > 0.8
+        assert 0 < sample(server, "suggested_tokens") < 16
+        assert sample(server, "predicted_wait_seconds_count") >= 8
+
+
+def test_where_the_loop_does_not_keep_up_calls_are_turned_away_unread(
+    server: BackgroundServer, robot: Robot, cloud: StubCloud
+) -> None:
+    cloud.hold()
+    running = robot.send(message("busy"))
+    cloud.wait_until_running()
+    service = server.server._service
+    assert service is not None
+    service.loop_watch.look = lambda: None  # type: ignore[method-assign]
+    service.loop_watch.late_s = 1.0
+    names = (f"robot-{i}" for i in range(1000))
+    codes = []
+
+    def unread() -> float:
+        codes.append(ask(robot, next(names), timeout_s=0.05).code())
+        return sample(server, "calls_refused_total", reason="congested")
+
+    assert eventually(unread) == 1
+    assert codes[-1] is grpc.StatusCode.RESOURCE_EXHAUSTED
+    cloud.release()
+    assert running.result()
+    assert robot.infer(message("later"))  # a model that rests is worth a look
+
+
+class Times:
+    """Both clocks of a loop."""
+
+    now_s = worked_s = 0.0
+
+
+def looks(watch: LoopWatch, times: Times, count: int, busy: float, late_s: float = 0.0) -> None:
+    for _ in range(count):
+        times.now_s += 0.05 + late_s
+        times.worked_s += busy * (0.05 + late_s)
+        watch.look()
+
+
+def test_a_loop_is_congested_where_it_works_all_the_time_or_comes_late() -> None:
+    times = Times()
+    watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
+    looks(watch, times, 20, busy=0.5)
+    assert not watch.congested
+    looks(watch, times, 20, busy=0.95)
+    assert watch.congested
+    looks(watch, times, 20, busy=0.3)
+    assert not watch.congested
+    looks(watch, times, 20, busy=0.3, late_s=0.2)
+    assert watch.congested
