@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from server_stubs import eventually
 
 CHROMIUM = next(
     (
@@ -71,9 +72,12 @@ class Visit:
         """What one element says."""
         return str(self.page.locator(selector).first.inner_text())
 
-    def wait(self, expression: str, argument: object = None) -> None:
-        """Returns when a JavaScript expression is true."""
-        self.page.wait_for_function(expression, arg=argument, timeout=60_000)
+    def wait(self, expression: str) -> None:
+        """Returns when a JavaScript expression is true.
+
+        Asked again and again from here: what waits inside the page would be against its policy.
+        """
+        eventually(lambda: self.page.evaluate(expression))
 
     def sideways(self) -> int:
         """Pixels by which the page is wider than the window."""

@@ -108,7 +108,7 @@ def test_a_step_is_on_the_page_within_a_second(page: Visit, robot: Robot) -> Non
     for step in range(2, 14):
         robot.infer(message("arm-1.0a1b2c3d.0", step))
         answered_s = time.time()
-        page.wait("(step) => step in window.shownAt", str(step))
+        page.wait(f"{step} in window.shownAt")
         delays.append(page.page.evaluate(f"window.shownAt['{step}']") - answered_s)
         time.sleep(0.05 * (step % 4))  # at different times after the event before
     assert statistics.median(delays) < 1.0
