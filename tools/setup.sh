@@ -115,6 +115,17 @@ need_dbus() {
         "sudo apt-get install dbus-daemon"
 }
 
+# Others look at the page of the fleet in a real browser.
+need_chromium() {
+    local name
+    for name in chromium chromium-browser google-chrome google-chrome-stable; do
+        if command -v "$name" >/dev/null; then return; fi
+    done
+    # Ubuntu's package of that name is a snap, which a container cannot run.
+    if ! grep -qs '^ID=ubuntu' /etc/os-release && may_install && apt_install chromium; then return; fi
+    say "the tests in a real browser will be skipped; to run them install chromium"
+}
+
 # ---- What was asked for ---------------------------------------------------------------------
 
 case $extra in
@@ -127,6 +138,7 @@ dev)
     need_gl
     need_prometheus
     need_dbus
+    need_chromium
     ;;
 proto)
     # Always here, because the test that regenerates the code looks for it here.

@@ -10,6 +10,7 @@ import grpc
 from comvla_server.admin_auth import AdminAuth, Asgi
 from comvla_server.auth import Authenticator
 from comvla_server.door import Door
+from comvla_server.fleet_page import assets
 from comvla_server.metrics import Metrics
 from comvla_server.ports import is_loopback
 from comvla_server.rate_limits import RateLimits
@@ -73,7 +74,9 @@ class Access:
         """The admin surface, behind its tokens where there are any."""
         if self._admin_tokens is None:
             return app
-        return AdminAuth(app, self._admin_tokens, self._settings.open_metrics)
+        # The page itself is no secret: it asks for a token, and then for everything else.
+        open_paths = [*assets(), *(["/metrics"] if self._settings.open_metrics else [])]
+        return AdminAuth(app, self._admin_tokens, open_paths)
 
     def look(self) -> None:
         """Reloads the files that have changed."""

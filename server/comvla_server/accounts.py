@@ -7,6 +7,8 @@ import logging
 from collections.abc import Awaitable, Callable
 
 from comvla.v1 import policy_pb2
+from comvla_server.calls import begin_call
+from comvla_server.fleet import Fleet
 from comvla_server.log_throttle import LogThrottle
 from comvla_server.metrics import Metrics
 from comvla_server.refusals import Reason, Refusal
@@ -29,6 +31,7 @@ class CallAccounts:
 
     Args:
         metrics: where calls are counted.
+        fleet: where people see them.
         default_deadline_s: of calls that bring none, seconds.
         clock: monotonic seconds.
 
@@ -37,12 +40,17 @@ class CallAccounts:
     """
 
     def __init__(
-        self, metrics: Metrics, default_deadline_s: float, clock: Callable[[], float]
+        self,
+        metrics: Metrics,
+        fleet: Fleet,
+        default_deadline_s: float,
+        clock: Callable[[], float],
     ) -> None:
         self.idle = asyncio.Event()
         self.idle.set()
         self._open = 0
         self._metrics = metrics
+        self._fleet = fleet
         self._default_deadline_s = default_deadline_s
         self._clock = clock
         self._throttle = LogThrottle(clock)
@@ -65,6 +73,8 @@ class CallAccounts:
             self._default_deadline_s if time_remaining_s is None else time_remaining_s
         )
         outcome = Reason.CANCELLED.value
+        response: policy_pb2.InferResponse | None = None
+        call = begin_call()
         self._open += 1
         self.idle.clear()
         try:
@@ -94,6 +104,7 @@ class CallAccounts:
             if not self._open:
                 self.idle.set()
             self._metrics.step_duration.labels(outcome).observe(self._clock() - started_s)
+            self._fleet.note(request, call, outcome, response)
 
     def note_refusal(self, request: policy_pb2.InferRequest, refusal: Refusal) -> None:
         """Counts a refusal, and logs it unless its like was logged a moment ago."""

@@ -11,6 +11,8 @@ from pydantic import BaseModel
 
 from comvla import codec
 from comvla.model_info import PROTOCOL_VERSION
+from comvla_server.fleet_feed import FleetFeed
+from comvla_server.fleet_page import add_page
 from comvla_server.lifecycle import Lifecycle, Phase
 from comvla_server.metrics import Metrics
 from comvla_server.service import PolicyService, Runtime
@@ -76,7 +78,11 @@ class Liveness(BaseModel):
 
 
 def create_app(
-    lifecycle: Lifecycle, metrics: Metrics, service: PolicyService, settings: ServerSettings
+    lifecycle: Lifecycle,
+    metrics: Metrics,
+    service: PolicyService,
+    settings: ServerSettings,
+    feed: FleetFeed,
 ) -> FastAPI:
     """The HTTP application. It reads objects of its own event loop, so it needs no lock.
 
@@ -85,6 +91,7 @@ def create_app(
         metrics: what ``/metrics`` shows.
         service: for the model and its sessions.
         settings: limits to describe.
+        feed: for the page.
     """
     app = FastAPI(
         title="ComVLA server",
@@ -124,6 +131,7 @@ def create_app(
         encode, content_type = choose_encoder(request.headers.get("accept", ""))
         return Response(encode(metrics.registry), media_type=content_type)
 
+    add_page(app, service.fleet, feed)
     return app
 
 

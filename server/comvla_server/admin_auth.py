@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
+from functools import partial
 from typing import Any
 
 from comvla_server.auth import bearer_token
 from comvla_server.tokens import TokenFile
+
+ADMITTED = "comvla_admitted"
+"""Key of the ASGI scope: a function that says whether the caller would be let in now as well. Who answers
+at length asks it now and then, so that a token that was taken away ends with what it opened."""
 
 # Probes carry no token, and learn no more than up or down.
 _OPEN = frozenset({"/healthz", "/readyz"})
@@ -27,17 +32,18 @@ class AdminAuth:
     Args:
         app: what is behind it.
         tokens: known tokens.
-        open_metrics: whether ``/metrics`` may be read without one.
+        open_paths: may be read without one, besides the probes.
     """
 
-    def __init__(self, app: Asgi, tokens: TokenFile, open_metrics: bool) -> None:
+    def __init__(self, app: Asgi, tokens: TokenFile, open_paths: Iterable[str] = ()) -> None:
         self._app = app
         self._tokens = tokens
-        self._open = _OPEN | {"/metrics"} if open_metrics else _OPEN
+        self._open = _OPEN.union(open_paths)
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Passes on, or answers 401."""
         if scope["type"] == "lifespan" or scope.get("path") in self._open or self._known(scope):
+            scope[ADMITTED] = partial(self._known, scope)
             await self._app(scope, receive, send)
             return
         headers = [

@@ -104,10 +104,12 @@ class _Uvicorn(uvicorn.Server):
 
 
 def _protocol(request_timeout_s: float) -> type[asyncio.Protocol]:
-    """An HTTP protocol whose requests have to arrive in time, on a bounded number of connections."""
+    """An HTTP protocol on a bounded number of connections. Requests have to arrive in time, and who
+    takes no more of an answer for so long is cut off."""
 
     class BoundedHttp(H11Protocol):
         _waiting: asyncio.TimerHandle | None = None
+        _stalled: asyncio.TimerHandle | None = None
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
@@ -128,9 +130,23 @@ def _protocol(request_timeout_s: float) -> type[asyncio.Protocol]:
             if self.cycle is answered and not self.transport.is_closing():
                 self._wait()
 
+        def pause_writing(self) -> None:
+            super().pause_writing()
+            self._stalled = self.loop.call_later(request_timeout_s, self._give_up)
+
+        def resume_writing(self) -> None:
+            super().resume_writing()
+            self._flowing()
+
         def connection_lost(self, exc: Exception | None) -> None:
             self._done()
+            self._flowing()
             super().connection_lost(exc)
+
+        def _flowing(self) -> None:
+            if self._stalled is not None:
+                self._stalled.cancel()
+                self._stalled = None
 
         def _wait(self) -> None:
             self._done()

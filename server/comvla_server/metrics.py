@@ -201,6 +201,16 @@ class Metrics:
         """Reads readiness at every scrape."""
         self._ready.set_function(lambda: float(ready()))
 
+    def refusals(self) -> dict[str, int]:
+        """Calls that ended without actions so far, by reason; reasons without any are left out."""
+        counts: dict[str, int] = {}
+        for counter in (self.requests_dropped, self.calls_refused):
+            for sample in next(iter(counter.collect())).samples:
+                if sample.name.endswith("_total") and sample.value:
+                    reason = sample.labels["reason"]
+                    counts[reason] = counts.get(reason, 0) + int(sample.value)
+        return counts
+
     def describe_model(self, info: ModelInfo, server_version: str) -> None:
         """Publishes which model answers."""
         self._model_info.labels(

@@ -17,12 +17,14 @@ from comvla_server.admin_http import AdminHttp
 from comvla_server.batcher import Batcher
 from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
+from comvla_server.fleet_feed import FleetFeed
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
 from comvla_server.inference_thread import InferenceThread
 from comvla_server.lifecycle import Lifecycle, Phase
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
 from comvla_server.ports import add_grpc_port, authority, listen
+from comvla_server.server_state import server_state
 from comvla_server.service import PolicyService, Runtime
 from comvla_server.settings import ServerSettings, SettingsError
 from comvla_server.validation import Validator
@@ -66,6 +68,7 @@ class Server:
         self._service: PolicyService | None = None
         self._grpc: grpc.aio.Server | None = None
         self._admin: AdminHttp | None = None
+        self._feed: FleetFeed | None = None
         self._access: Access | None = None
         self._watching: list[asyncio.Task[None]] = []
         self._thread: InferenceThread | None = None
@@ -121,7 +124,9 @@ class Server:
         self.admin_port = admin_socket.getsockname()[1]
         self._service, self._grpc = service, server
         self.metrics.watch_ready(lambda: self.lifecycle.ready)
-        app = access.guard(create_app(self.lifecycle, self.metrics, service, settings))
+        state = server_state(self.lifecycle, self.metrics, service)
+        self._feed = feed = FleetFeed(service.fleet, state)
+        app = access.guard(create_app(self.lifecycle, self.metrics, service, settings, feed))
         self._admin = AdminHttp(app, admin_socket, settings, access.https_context())
         self._admin.start()
         await server.start()
@@ -198,6 +203,8 @@ class Server:
         finished = await self._drain(self.settings.grace_s if grace_s is None else grace_s)
         if self._grpc is not None:
             await self._grpc.stop(_FLUSH_S)
+        if self._feed is not None:
+            await self._feed.close()
         if self._admin is not None:
             await self._admin.stop()
         for task in self._watching:

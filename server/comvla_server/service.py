@@ -13,13 +13,15 @@ import grpc
 
 from comvla import codec, handshake
 from comvla.errors import CodecError
-from comvla.images import MAX_VIEW_PIXELS, picture_bytes
+from comvla.images import MAX_VIEW_PIXELS, coding_name, picture_bytes
 from comvla.load_hints import LoadHints
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.accounts import Answered, CallAccounts
 from comvla_server.batcher import Batcher
+from comvla_server.calls import CallRecord, this_call
 from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
+from comvla_server.fleet import Fleet
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.loop_watch import LoopWatch
 from comvla_server.memory import BytesInFlight, Lease
@@ -79,11 +81,13 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         lifecycle: whether calls are welcome.
         metrics: where calls are counted.
         settings: limits and the default deadline.
+        fleet: where people see calls.
         clock: monotonic seconds.
 
     Attributes:
         runtime: the loaded model behind its queue, None while loading.
         loop_watch: whether the event loop keeps up; runs where its ``run`` does.
+        fleet: what robots did lately.
     """
 
     def __init__(
@@ -91,6 +95,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         lifecycle: Lifecycle,
         metrics: Metrics,
         settings: ServerSettings,
+        fleet: Fleet | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.runtime: Runtime | None = None
@@ -99,7 +104,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         self._settings = settings
         self._clock = clock
         self.loop_watch = LoopWatch()
-        self._accounts = CallAccounts(metrics, settings.default_deadline_s, clock)
+        self.fleet = fleet or Fleet()
+        self._accounts = CallAccounts(metrics, self.fleet, settings.default_deadline_s, clock)
         self._in_flight = BytesInFlight(settings.max_bytes_in_flight)
         metrics.watch_bytes(lambda: self._in_flight.held)
 
@@ -211,7 +217,10 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             "build requests from the contract's generated code",
         )
         self._count_message(size_bytes)
-        self._accounts.note_refusal(policy_pb2.InferRequest(), refusal)
+        nobodys = policy_pb2.InferRequest()
+        self._accounts.note_refusal(nobodys, refusal)
+        call = CallRecord(wire_bytes=codec.wire_bytes(size_bytes))
+        self.fleet.note(nobodys, call, refusal.reason.value, None)
         return refusal
 
     def _require_runtime(self) -> Runtime:
@@ -284,6 +293,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             decode_began_s = self._clock()
             lease.take(_decoded_bytes(request))
             policy_request = await self._read(runtime, request, deadline_s)
+            this_call().note_read(policy_request, runtime.engine.info)
             decode_s = self._clock() - decode_began_s
             self._metrics.step_phase.labels("decode").observe(decode_s)
             # While pictures were decoded, a repeat of this step or a newer one may have come.
@@ -338,14 +348,18 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
     def _count_message(self, size_bytes: int) -> None:
         """What crossed the link, whatever becomes of it."""
-        self._metrics.tx_framed_bytes.inc(codec.wire_bytes(size_bytes))
+        wire_bytes = codec.wire_bytes(size_bytes)
+        self._metrics.tx_framed_bytes.inc(wire_bytes)
+        this_call().wire_bytes += wire_bytes
 
     def _count_content(self, request: policy_pb2.InferRequest) -> None:
         self._count_payload(request.payload)
         if request.HasField("images"):
+            file_bytes = picture_bytes(request.images)
             self._metrics.tx_encoded_bytes.inc(request.images.ByteSize())
-            self._metrics.tx_image_bytes.inc(picture_bytes(request.images))
-            self._metrics.tx_payload_bytes.inc(picture_bytes(request.images))
+            self._metrics.tx_image_bytes.inc(file_bytes)
+            self._metrics.tx_payload_bytes.inc(file_bytes)
+            this_call().note_content(file_bytes, coding_name(request.images.coding) or "")
 
     def _count_payload(self, payload: bytes | bytearray) -> None:
         metrics = self._metrics
@@ -359,6 +373,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         metrics.request_tokens.observe(tokens)
         paper_bytes = codec.payload_bytes(tokens, header.token_dim, header.quantization)
         metrics.tx_payload_bytes.inc(paper_bytes)
+        this_call().note_content(paper_bytes, header.quantization)
 
 
 def _announced_tokens(payload: bytes) -> int:

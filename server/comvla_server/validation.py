@@ -27,7 +27,7 @@ MAX_INSTRUCTION_CHARS = 2000
 # finite but overflow inside a model.
 MAX_ABS_VALUE = 65504.0
 
-_SESSION_ID = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._:@/+=-]{{0,{MAX_SESSION_ID_CHARS - 1}}}")
+SESSION_ID = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._:@/+=-]{{0,{MAX_SESSION_ID_CHARS - 1}}}")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Validator:
                 f"says {shown(request.model_fingerprint)}: "
                 "load the edge half of the same checkpoint",
             )
-        if not _SESSION_ID.fullmatch(request.session_id):
+        if not SESSION_ID.fullmatch(request.session_id):
             raise Refusal(
                 Reason.INVALID,
                 f"expected a session_id of 1 to {MAX_SESSION_ID_CHARS} letters, digits or ._:@/+=- "

@@ -62,7 +62,15 @@ def test_metrics_are_prometheus_text_at_exactly_that_path(http: httpx.Client) ->
 
 def test_every_path_is_in_the_open_api_description(http: httpx.Client) -> None:
     paths = http.get("/openapi.json").json()["paths"]
-    assert set(paths) == {"/healthz", "/readyz", "/v1/model", "/v1/sessions", "/metrics"}
+    assert set(paths) == {
+        "/healthz",
+        "/readyz",
+        "/v1/model",
+        "/v1/sessions",
+        "/v1/fleet/tokens",
+        "/events",
+        "/metrics",
+    }
     assert all(set(operations) == {"get"} for operations in paths.values())
 
 

@@ -1,4 +1,4 @@
-"""``comvla-sim bench transport | edge | batching | model | wire | idle | overload | soak``."""
+"""``comvla-sim bench transport | edge | batching | model | wire | idle | overload | soak | fuzz``."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Registers ``bench`` and its benchmarks."""
     parser = subparsers.add_parser(
         "bench",
-        help="measure transport, edge computations, batching, model and link against their limits",
+        help="measure transport, edge computations, batching, model and link against their limits; fuzz",
         description="Each benchmark measures its own limit in the same run and reports ratios.",
     )
     benches = parser.add_subparsers(dest="bench", required=True, metavar="BENCH")
     for name, (text, add_options) in _BENCHES.items():
         bench = benches.add_parser(name, help=text, description=text)
         bench.add_argument("--json", action="store_true", help="print one JSON object")
-        if name not in _BY_THE_CLOCK:
+        if name not in _UNREPEATED:
             bench.add_argument(
                 "--repetitions", type=whole(1), help="timed calls (default: the bench's own)"
             )
@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
         "idle": _idle,
         "overload": _overload,
         "soak": _soak,
+        "fuzz": _fuzz,
     }[args.bench](args)
     print(json.dumps(result, indent=2) if args.json else _text(result))
     return 0 if result.get("passed", True) else 1
@@ -161,6 +162,16 @@ def _link_options(parser: argparse.ArgumentParser, rate: str) -> None:
     parser.add_argument("--mbit-per-s", type=number(0.001), help=f"rate of the link ({rate})")
 
 
+def _fuzz_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--requests", type=whole(1), help="mutated requests (10000)")
+    parser.add_argument("--seed", type=whole(), help="of all of them (0)")
+    parser.add_argument("--only", type=whole(), metavar="CASE", help="one case, by its number")
+    parser.add_argument(
+        "--seconds", type=number(), metavar="S", help="begin no case after (no limit)"
+    )
+    parser.add_argument("--processes", type=whole(1), help="at work in process at once (2)")
+
+
 _BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
     "transport": ("68 KiB up, 1 KiB down, against raw TCP and a websocket", _transport_options),
     "edge": ("vote, select, quantise, pack, against a matrix product", _edge_options),
@@ -179,8 +190,9 @@ _BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
         "memory and descriptors of a server under steady load; exit code 1 where they grow",
         _soak_options,
     ),
+    "fuzz": ("hostile requests, against crashes, leaks and wrong status codes", _fuzz_options),
 }
-_BY_THE_CLOCK = {"overload", "soak"}
+_UNREPEATED = {"overload", "soak", "fuzz"}
 
 
 def _transport(args: argparse.Namespace) -> dict[str, Any]:
@@ -237,6 +249,14 @@ def _soak(args: argparse.Namespace) -> dict[str, Any]:
     total = round(60.0 * parameters.minutes)
     with progress("seconds") as show:
         return soak.run(parameters, lambda seconds: show(min(int(seconds), total), total))
+
+
+def _fuzz(args: argparse.Namespace) -> dict[str, Any]:
+    from comvla_sim.fuzz.run import FuzzParameters, run
+    from comvla_sim.netlink.command import progress
+
+    with progress("requests") as on_request:
+        return run(_given(FuzzParameters, args), on_request)
 
 
 def _given(parameters: Callable[..., Any], args: argparse.Namespace) -> Any:

@@ -54,6 +54,8 @@ _HEADS = {
     "bytes_per_query": "bytes a query",
     "needs_root": "needs root",
     "queries": "queries",
+    "requests": "requests",
+    "ended": "how they ended",
     "under": "under",
     "least_over_percent": "least over %",
     "most_over_percent": "most over %",
@@ -122,6 +124,8 @@ def _conclusions(result: Mapping[str, Any]) -> list[str]:
         return _overload_conclusions(result)
     if result["bench"] == "soak":
         return _soak_conclusions(result)
+    if result["bench"] == "fuzz":
+        return _fuzz_conclusions(result)
     return []
 
 
@@ -158,6 +162,26 @@ def _soak_conclusions(result: Mapping[str, Any]) -> list[str]:
         f"resident memory after the first sixth: {100 * result['growth']:+.2f} %, descriptors: "
         f"{result['descriptors_growth']:+.0f}: {'passed' if result['passed'] else 'FAILED'}",
     ]
+
+
+def _fuzz_conclusions(result: Mapping[str, Any]) -> list[str]:
+    seed = result["parameters"]["seed"]
+    lines = ["", f"{result['requests']} requests of seed {seed} in {result['wall_s']:.0f} s"]
+    for process in result["memory"]:
+        if process["measured"]:
+            warm, end = process["warm_bytes"] / 2**20, process["end_bytes"] / 2**20
+            files = f"{process['warm_descriptors']} to {process['end_descriptors']} descriptors"
+            lines.append(
+                f"{process['name']}: {warm:.1f} MiB when warm, {end:.1f} at the end; {files}"
+            )
+    for failure in result["failures"]:
+        lines.append(f"case {failure['case']} ({failure['kind']}): {failure['what']}")
+    if result["failed"]:
+        lines.append(f"{result['failed']} cases failed; repeat one: --seed {seed} --only CASE")
+    if result["parameters"]["only"] is not None and result["words"]:
+        lines.append(f"it was told: {result['words']}")
+    lines.append("passed" if result["passed"] else "NOT passed")
+    return lines
 
 
 def _model_conclusions(result: Mapping[str, Any]) -> list[str]:

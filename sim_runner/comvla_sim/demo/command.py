@@ -29,6 +29,8 @@ Starts a policy server as a process of its own and lets a simulated arm obey ins
 different fixtures, its tokens crossing a simulated Rician link that withholds whatever exceeds the
 capacity of a control period. Each episode is repeated with every token on a link without limit.
 What happened is left as one HTML file that loads nothing.
+
+With --fleet N arms go on, in real time, until Ctrl-C, and the server's own live page shows them.
 """
 
 
@@ -48,6 +50,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--mean-snr-db", type=number(-200, 200), default=10.0, help="of the link, dB (10)"
     )
     parser.add_argument("--episodes", type=whole(), default=4, help="instructions to obey (4)")
+    parser.add_argument(
+        "--fleet", type=whole(1), metavar="N", help="N arms for the server's live page, no film"
+    )
+    parser.add_argument(
+        "--seconds", type=number(0.0), metavar="S", help="how long the fleet works (until Ctrl-C)"
+    )
     parser.add_argument("--model", default="mini", help="mini or a checkpoint folder (mini)")
     parser.add_argument("--open", action="store_true", help="show the page in a browser")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -60,6 +68,10 @@ def run(args: argparse.Namespace) -> int:
     from comvla_sim.demo.server_process import ServerProcess, ServerProcessError
     from comvla_sim.worlds.tabletop import Tabletop
 
+    if args.fleet is not None:
+        return _run_fleet(args)
+    if args.seconds is not None:
+        raise EvaluationError("--seconds is how long a fleet works: give --fleet N as well")
     started = time.monotonic()
     # What is wrong with the options is said before anything is started.
     scenes(Tabletop.tasks, seed=args.seed, episodes=args.episodes)
@@ -85,6 +97,39 @@ def run(args: argparse.Namespace) -> int:
         import webbrowser
 
         webbrowser.open(args.out.resolve().as_uri())
+    return 0
+
+
+def _run_fleet(args: argparse.Namespace) -> int:
+    """Robots that go on until somebody has seen enough. Returns 1 when server or robots failed."""
+    from comvla_sim.demo.fleet import FleetError, FleetOfRobots, FleetPlan
+    from comvla_sim.demo.scenario import fading
+    from comvla_sim.demo.server_process import ServerProcess, ServerProcessError
+
+    fading(args.mean_snr_db, seed=0)  # what is wrong with it is said before anything is started
+    counts = {"episodes": 0, "successes": 0}
+
+    def count(success: bool) -> None:
+        counts["episodes"] += 1
+        counts["successes"] += success
+
+    with _terminated_like_interrupted():
+        try:
+            with contextlib.suppress(KeyboardInterrupt), ServerProcess(args.model) as server:
+                plan = FleetPlan(server.target, args.model, args.fleet, args.mean_snr_db, args.seed)
+                print(f"{args.fleet} robots, to watch at {server.admin_url}", flush=True)
+                if args.open:
+                    import webbrowser
+
+                    webbrowser.open(server.admin_url)
+                with FleetOfRobots(plan, count) as fleet:
+                    fleet.watch(args.seconds, lambda: server.running)
+                server.require_running()
+        except (ServerProcessError, FleetError) as error:
+            print(f"comvla-sim demo: {error}", file=sys.stderr)
+            return 1
+    said = f"{counts['successes']} of {counts['episodes']} episodes succeeded"
+    print(json.dumps(counts) if args.json else said)
     return 0
 
 

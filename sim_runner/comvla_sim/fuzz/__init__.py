@@ -1,0 +1,1 @@
+"""Hostile requests by the million: structure-aware mutations against the real server."""
