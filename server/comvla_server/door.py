@@ -66,6 +66,7 @@ class Door(grpc.aio.ServerInterceptor):
     Attributes:
         glance: asked before a call for actions is looked at, with the seconds that it has: a refusal where it would
             be read in vain.
+        on_lost: told of each call that ended while it was read.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class Door(grpc.aio.ServerInterceptor):
         self._metrics = metrics
         self._throttle = LogThrottle(time.monotonic)
         self._guards: dict[str, tuple[Any, Any]] = {}
+        self.on_lost: Callable[[], None] = lambda: None
         self.glance: Callable[[float | None], Refusal | None] = lambda time_remaining_s: None
 
     async def intercept_service(
@@ -174,6 +176,9 @@ class Door(grpc.aio.ServerInterceptor):
             message = await _within(anext(requests), self._timeout_s)
         except StopAsyncIteration:
             return None
+        except asyncio.CancelledError:
+            self.on_lost()
+            raise
         except asyncio.TimeoutError:
             raise Refusal(
                 Reason.SLOW,
