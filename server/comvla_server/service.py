@@ -142,7 +142,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             time_remaining_s: seconds until the caller gives up, None where it did not say.
         """
         watch = self.loop_watch
-        if self.runtime is None or time_remaining_s is None:
+        if not self._settings.admission or self.runtime is None or time_remaining_s is None:
             return None
         if watch.skips():
             return Refusal(
