@@ -41,6 +41,7 @@ else:
 
 
 _MOST_METHODS = 256
+_TRANSIT_S = 0.05  # a robot's own deadline is over earlier than it seems here
 
 _Context = Any  # grpc.aio.ServicerContext
 _HEALTH = f"/{health.SERVICE_NAME}/"
@@ -66,6 +67,7 @@ class Door(grpc.aio.ServerInterceptor):
     Attributes:
         glance: asked before a call for actions is looked at, with the seconds that it has: a refusal where it would
             be read in vain.
+        on_lost: told of each call that ended while it was read.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class Door(grpc.aio.ServerInterceptor):
         self._metrics = metrics
         self._throttle = LogThrottle(time.monotonic)
         self._guards: dict[str, tuple[Any, Any]] = {}
+        self.on_lost: Callable[[], None] = lambda: None
         self.glance: Callable[[float | None], Refusal | None] = lambda time_remaining_s: None
 
     async def intercept_service(
@@ -174,6 +177,9 @@ class Door(grpc.aio.ServerInterceptor):
             message = await _within(anext(requests), self._timeout_s)
         except StopAsyncIteration:
             return None
+        except asyncio.CancelledError:
+            self.on_lost()
+            raise
         except asyncio.TimeoutError:
             raise Refusal(
                 Reason.SLOW,
@@ -240,6 +246,11 @@ class _Entry:
             message = await self._door.read(messages, identity)
         except Refusal as refusal:
             await self.refuse(refusal, context)
+        if message is None and _given_up(context):
+            await context.abort(
+                grpc.StatusCode.DEADLINE_EXCEEDED,
+                "expected the request before its deadline, it had not come: allow more time",
+            )
         if message is None:
             await context.abort(
                 grpc.StatusCode.INVALID_ARGUMENT, "expected one request, got none: send a message"
@@ -254,3 +265,9 @@ class _Entry:
         """Ends a call that may not go on."""
         self._door.note(refusal, self._method, context.peer())
         await context.abort(STATUS[refusal.reason], refusal.message, hints(refusal))
+
+
+def _given_up(context: _Context) -> bool:
+    """Whether a call has ended for its caller; gRPC shows that as the end of its messages."""
+    remaining_s = context.time_remaining()
+    return context.cancelled() or (remaining_s is not None and remaining_s < _TRANSIT_S)

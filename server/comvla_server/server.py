@@ -111,6 +111,7 @@ class Server:
         server = make_grpc_server(settings, [access.door])
         service = PolicyService(self.lifecycle, self.metrics, settings)
         access.door.glance = service.glance
+        access.door.on_lost = lambda: service.loop_watch.note(died=True)
         add_policy_service(server, service)
         await self._health.register(server)
         admin_socket = listen(settings.admin_address, settings.admin_port, "--admin-port")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -141,7 +141,16 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         Args:
             time_remaining_s: seconds until the caller gives up, None where it did not say.
         """
-        if self.runtime is None or not self.loop_watch.congested or time_remaining_s is None:
+        watch = self.loop_watch
+        if not self._settings.admission or self.runtime is None or time_remaining_s is None:
+            return None
+        if watch.skips():
+            return Refusal(
+                Reason.CONGESTED,
+                "more calls come than this machine can read in time: ask again later, or add a replica",
+                retry_after_s=min(1.0, max(0.0, time_remaining_s)),
+            )
+        if not watch.congested:
             return None
         return self.runtime.batcher.glance(self._clock() + time_remaining_s)
 
@@ -184,7 +193,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 lease.take(request.ByteSize())
                 return await self._answer(request, lease, started_s, deadline_s)
 
-        return await self._accounts.run(request, time_remaining_s, work)
+        return await self._watched(self._accounts.run(request, time_remaining_s, work))
 
     async def infer_progressive(
         self, messages: AsyncIterator[Any], time_remaining_s: float | None
@@ -207,7 +216,23 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             with self._in_flight.lease() as lease:
                 return await self._answer_stream(request, messages, lease, started_s, deadline_s)
 
-        return await self._accounts.run(request, time_remaining_s, work)
+        return await self._watched(self._accounts.run(request, time_remaining_s, work))
+
+    async def _watched(
+        self, answer: Awaitable[policy_pb2.InferResponse]
+    ) -> policy_pb2.InferResponse:
+        """Tells the loop's watch what became of a call."""
+        died = False
+        try:
+            return await answer
+        except asyncio.CancelledError:
+            died = True
+            raise
+        except Refusal as refusal:
+            died = refusal.reason is Reason.DEADLINE
+            raise
+        finally:
+            self.loop_watch.note(died=died)
 
     def note_malformed(self, size_bytes: int) -> Refusal:
         """Counts bytes that are no InferRequest, and says so."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import grpc
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from server_stubs import Robot, StubCloud, eventually, message
 
@@ -152,3 +153,31 @@ def test_a_loop_is_congested_where_it_works_all_the_time_or_comes_late() -> None
     assert not watch.congested
     looks(watch, times, 20, busy=0.3, late_s=0.2)
     assert watch.congested
+
+
+def test_a_congested_loop_looks_at_fewer_calls_until_the_others_live() -> None:
+    times, drawn = Times(), [0.5]
+    watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s, lambda: drawn[0])
+    looks(watch, times, 10, busy=0.95)
+    assert watch.looked_at == 1.0
+    assert not watch.skips()
+    for _ in range(5):
+        watch.note(died=True)
+        looks(watch, times, 1, busy=0.95)
+    assert watch.looked_at == pytest.approx(0.8**5)
+    assert watch.skips()
+    drawn[0] = 0.1
+    assert not watch.skips()
+    for _ in range(60):
+        watch.note(died=False)
+        looks(watch, times, 1, busy=0.95)
+    assert watch.looked_at == 1.0
+
+
+def test_calls_that_die_while_the_loop_has_time_are_their_own_affair() -> None:
+    times = Times()
+    watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
+    for _ in range(20):
+        watch.note(died=True)
+        looks(watch, times, 1, busy=0.2)
+    assert watch.looked_at == 1.0

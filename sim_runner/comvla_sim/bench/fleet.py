@@ -10,7 +10,7 @@ import asyncio
 import heapq
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -46,6 +46,7 @@ class Tally:
         paused: not sent, because the robot backed off.
         tokens: sent with those that were answered.
         durations_s: of those that were answered.
+        codes: of those that failed.
     """
 
     answered: int = 0
@@ -56,6 +57,7 @@ class Tally:
     paused: int = 0
     tokens: int = 0
     durations_s: list[float] = field(default_factory=list)
+    codes: Counter[str] = field(default_factory=Counter)
 
     @property
     def offered(self) -> int:
@@ -248,6 +250,8 @@ class _Robot:
             tally.tokens += response.tokens_used
             tally.durations_s.append(took_s)
         ending = _ENDINGS.get(code, "failed")
+        if ending == "failed":
+            tally.codes[code] += 1
         setattr(tally, ending, getattr(tally, ending) + 1)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -202,6 +203,7 @@ def _summary(tallies: list[Tally], capacity: float, seconds: float) -> dict[str,
         "late_share": late / offered,
         "paused_share": sum(t.paused for t in tallies) / offered,
         "failed": sum(t.failed for t in tallies),
+        "failed_codes": dict(sum((t.codes for t in tallies), Counter())),
         "jain": jain_index([t.answered for t in tallies]),
         "least_answers": min(t.answered for t in tallies),
         "mean_tokens": sum(t.tokens for t in tallies) / max(1, answered),

@@ -32,9 +32,9 @@ STUB_INFO = ModelInfo(
 class StubTimes:
     """Seconds of a pass: ``fixed_s + request_s · requests + token_s · tokens``."""
 
-    fixed_s: float = 0.010
-    request_s: float = 0.002
-    token_s: float = 0.00005
+    fixed_s: float = 0.020
+    request_s: float = 0.004
+    token_s: float = 0.0001
 
 
 class StubModel:
