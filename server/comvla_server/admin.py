@@ -111,6 +111,9 @@ def create_app(
         if service.runtime is not None and lifecycle.ready and not service.runtime.batcher.alive:
             response.status_code = 503
             return Liveness(status="the dispatcher has died: restart the server")
+        if lifecycle.phase is Phase.STOPPED:
+            response.status_code = 503
+            return Liveness(status="gRPC takes no calls any more: restart the server")
         return Liveness(status="ok")
 
     @app.get("/readyz", summary="Readiness: send robots here only while this is 200")

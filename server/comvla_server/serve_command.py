@@ -106,6 +106,7 @@ async def _serve(settings: ServerSettings, load: Callable[[], Engine]) -> int:
     await server.bind()
     ready = asyncio.create_task(server.make_ready())
     stopping = asyncio.create_task(stop.wait())
+    lost = asyncio.create_task(server.port_lost.wait())
     try:
         await asyncio.wait({ready, stopping}, return_when=asyncio.FIRST_COMPLETED)
         if ready.done():
@@ -119,14 +120,15 @@ async def _serve(settings: ServerSettings, load: Callable[[], Engine]) -> int:
                 f"model={info.name}",
                 flush=True,
             )
-            await stopping
+            await asyncio.wait({stopping, lost}, return_when=asyncio.FIRST_COMPLETED)
     finally:
         ready.cancel()
         stopping.cancel()
+        lost.cancel()
         finished = await server.stop()
         with contextlib.suppress(asyncio.CancelledError):
             await ready
-    return 0 if finished else 1
+    return 0 if finished and not server.port_lost.is_set() else 1
 
 
 def _stop_on_signals() -> asyncio.Event:

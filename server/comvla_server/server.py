@@ -19,6 +19,7 @@ from comvla_server.decoding import Decoding
 from comvla_server.engine import Engine
 from comvla_server.fleet_feed import FleetFeed
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
+from comvla_server.grpc_port import start_watched
 from comvla_server.inference_thread import InferenceThread
 from comvla_server.lifecycle import Lifecycle, Phase
 from comvla_server.load_policy import LoadPolicy
@@ -53,6 +54,7 @@ class Server:
         metrics: its counters.
         port: gRPC port, known after :meth:`bind`.
         admin_port: HTTP port, known after :meth:`bind`.
+        port_lost: set when gRPC has stopped taking calls by itself: the process should end.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Server:
         self.metrics = Metrics()
         self.port = 0
         self.admin_port = 0
+        self.port_lost = asyncio.Event()
         self._engine = engine
         self._health = HealthReporter()
         self._service: PolicyService | None = None
@@ -130,7 +133,7 @@ class Server:
         app = access.guard(create_app(self.lifecycle, self.metrics, service, settings, feed))
         self._admin = AdminHttp(app, admin_socket, settings, access.https_context())
         self._admin.start()
-        await server.start()
+        await start_watched(server, self._lose_port)
         self._access = access
         self._watching = [
             asyncio.create_task(access.watch()),
@@ -185,6 +188,11 @@ class Server:
         _log.info("serving %s", engine.info.name, extra={"grpc": self.target})
         return engine.info
 
+    def _lose_port(self) -> None:
+        """Robots are not answered any more, and will not be: /healthz and /readyz say so."""
+        self.lifecycle.enter(Phase.STOPPED)
+        self.port_lost.set()
+
     def reload(self) -> None:
         """Looks now for certificates and tokens that have changed, instead of a little later."""
         if self._access is not None:
@@ -203,7 +211,9 @@ class Server:
         await self._health.draining()
         finished = await self._drain(self.settings.grace_s if grace_s is None else grace_s)
         if self._grpc is not None:
-            await self._grpc.stop(_FLUSH_S)
+            # A server whose loop has ended raises what ended it.
+            with contextlib.suppress(UnicodeDecodeError):
+                await self._grpc.stop(_FLUSH_S)
         if self._feed is not None:
             await self._feed.close()
         if self._admin is not None:

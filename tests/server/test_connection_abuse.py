@@ -346,3 +346,17 @@ def test_old_tls_is_refused(cloud: StubCloud, tls_files: dict[str, Path]) -> Non
                 pytest.raises((ssl.SSLError, ConnectionResetError)),
             ):
                 context.wrap_socket(plain)
+
+
+def test_a_server_whose_port_a_stranger_closed_asks_to_be_restarted(
+    server: BackgroundServer,
+) -> None:
+    """A path that is no UTF-8 ends the loop in which grpc.aio takes calls, whoever sends it."""
+    names = (":method", "POST"), (":scheme", "http"), ("te", "trailers"), (":authority", "x")
+    block = b"".join(itertools.starmap(header, names)) + b"\x00\x05:path\x03/a\xf4"
+    with socket.create_connection(("127.0.0.1", server.server.port)) as stranger:
+        stranger.sendall(PREFACE + frame(SETTINGS, 0, 0, b""))
+        stranger.sendall(frame(HEADERS, END_HEADERS | END_STREAM, 1, block))
+        eventually(lambda: httpx.get(f"{server.admin_url}/healthz").status_code == 503)
+    assert httpx.get(f"{server.admin_url}/readyz").status_code == 503
+    assert server.server.port_lost.is_set()

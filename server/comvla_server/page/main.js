@@ -41,6 +41,12 @@ function state(cls, word) {
   say(find("state-word"), word);
 }
 
+/** A number and its unit, which may be missing. */
+function parted(text) {
+  const [value, unit = ""] = text.split("\u00a0");
+  return [value, unit];
+}
+
 function tiles(now_s) {
   const { server, seconds, total, robots } = history;
   const rates = sums(seconds, now_s, WINDOW_S, ["answered", "wire_bytes", "payload_bytes"]);
@@ -53,9 +59,9 @@ function tiles(now_s) {
   const parts = [
     ["Robots", fixed(robots.size), "", `${answering} answering`],
     ["Answers", short(rates.answered / WINDOW_S), "per s", `${fixed(total.answered)} in all`],
-    ["Answer time", ...ms(recent("total_ms")).split("\u00a0"), `slowest ${ms(most(seconds, now_s, WINDOW_S, "slowest_ms"))}`],
+    ["Answer time", ...parted(ms(recent("total_ms"))), `slowest ${ms(most(seconds, now_s, WINDOW_S, "slowest_ms"))}`],
     ["Tokens in use", short(tokens), all ? `of ${fixed(all)}` : "", share],
-    ["Uplink", ...(bytes(rates.wire_bytes / WINDOW_S) + "/s").split("\u00a0"), `payload ${bytes(rates.payload_bytes / WINDOW_S)}/s`],
+    ["Uplink", ...parted(bytes(rates.wire_bytes / WINDOW_S) + "/s"), `payload ${bytes(rates.payload_bytes / WINDOW_S)}/s`],
     ["Without an answer", fixed(minute.refused + minute.bridged), "in 1 min", `${fixed(minute.refused)} refused, ${fixed(minute.bridged)} bridged`],
     ["Model busy", busy, "%", `${fixed(server.queue_depth)} in the queue`],
   ];
@@ -67,7 +73,7 @@ function tiles(now_s) {
   parts.forEach(([, value, unit, more], i) => {
     const [, big, small] = place.children[i].children;
     say(big.children[0], value);
-    say(big.children[1], unit ?? "");
+    say(big.children[1], unit);
     say(small, more);
   });
 }
@@ -98,6 +104,7 @@ function draw() {
   charts.draw(history.seconds, robot?.seconds ?? [], robot ? split(robot.name)[0] : "", now_s, history.kept_s);
   table.update(robots, now_s, chosen.number);
   find("no-robots").hidden = robots.size > 0;
+  find("robots-table").hidden = !robots.size;
   say(find("robots-note"), robots.size ? `${robots.size} seen in the last minute` : "");
   chosen.update(robot, now_s);
   why();
