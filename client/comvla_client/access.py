@@ -15,6 +15,7 @@ import grpc.aio
 
 from comvla.errors import ComVLAError
 from comvla_client import channel
+from comvla_client.tracing import trace_headers
 
 _log = logging.getLogger(__name__)
 
@@ -130,16 +131,16 @@ class Access:
         return grpc.aio.secure_channel(self.target, credentials, options=self._options)
 
     def metadata(self) -> Metadata:
-        """Headers of the next call, with the token of now."""
+        """Headers of the next call, with the token of now, and the trace that it belongs to."""
         if self._token is None:
-            return ()
+            return trace_headers()
         if not isinstance(self._token, str):
             try:
                 self._last_token = _read_token(self._token)
             except AccessError as error:
                 # A file that is being replaced must not stop a robot that was let in before.
                 _log.warning("the last token is used again: %s", error)
-        return (("authorization", f"Bearer {self._last_token}"),)
+        return (("authorization", f"Bearer {self._last_token}"), *trace_headers())
 
     def _renewed(self) -> grpc.ChannelCredentials | None:
         if self._tls is not None:

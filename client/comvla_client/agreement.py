@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from comvla import handshake
 from comvla.errors import HandshakeError
 from comvla.model_info import ModelInfo
 
 
-def check_model(cloud: ModelInfo, edge: ModelInfo) -> None:
+def check_model(cloud: ModelInfo, edge: ModelInfo, also: Iterable[str] = ()) -> None:
     """Compares the server's model with the robot's half.
 
     What a robot sends for an observation is for its uplink form to compare (``check_server``).
@@ -15,10 +17,11 @@ def check_model(cloud: ModelInfo, edge: ModelInfo) -> None:
     Args:
         cloud: the server's description of its model, read with :func:`comvla.handshake.from_response`.
         edge: the robot's half.
+        also: fingerprints of models whose robots the server answers too.
 
     Raises:
         HandshakeError: the first difference in words, with its remedy.
     """
-    difference = handshake.mismatch(edge, cloud)
+    difference = handshake.mismatch(edge, cloud, also)
     if difference is not None:
         raise HandshakeError(difference)

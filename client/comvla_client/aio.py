@@ -16,12 +16,14 @@ from comvla_client.edge import EdgeModel
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.observation import Observation
 from comvla_client.queue import Actions
+from comvla_client.reaching import make_aio_transport
 from comvla_client.report import ActionChunk
 from comvla_client.selection import Selector
 from comvla_client.sending import SendingPolicy
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading
-from comvla_client.transport_aio import AsyncTransport, GrpcAioTransport
+from comvla_client.tracing import Tracing, traced
+from comvla_client.transport_aio import AsyncTransport
 from comvla_client.uplink import UplinkForm
 
 
@@ -55,6 +57,8 @@ class AsyncComVLAClient:
         tls: TlsOptions | None = None,
         token: Token | None = None,
         insecure: bool = False,
+        model: str = "",
+        tracing: Tracing | None = None,
     ) -> None:
         self._core = ClientCore(
             edge,
@@ -71,15 +75,16 @@ class AsyncComVLAClient:
             hold=hold,
             session_id=session_id,
             seed=seed,
+            model=model,
         )
+        self._tracing = tracing
         self._connect_timeout_s = connect_timeout_s
         self._lock = asyncio.Lock()
         self._connected = False
         self._closed = False
+        self._transport: AsyncTransport
         if isinstance(target, str):
-            self._transport: AsyncTransport = GrpcAioTransport(
-                target, tls, token, insecure=insecure
-            )
+            self._transport = make_aio_transport(target, tls, token, insecure=insecure, model=model)
         else:
             check_unused(tls, token, insecure)
             self._transport = target
@@ -170,10 +175,16 @@ class AsyncComVLAClient:
         self, obs: Observation, instr: str, snr: float | SnrReading | None
     ) -> ActionChunk:
         await self.connect()
-        prepared = await self._prepare(obs, instr, snr)
-        if prepared.request is None:
-            return self._core.fail(prepared)
-        return await self._call(prepared)
+        with traced(self._tracing) as trace:
+            prepared = await self._prepare(obs, instr, snr)
+            trace.prepared(prepared)
+            if prepared.request is None:
+                chunk = self._core.fail(prepared)
+            else:
+                with trace.call():
+                    chunk = await self._call(prepared)
+            trace.done(chunk)
+        return chunk
 
     async def _prepare(
         self, obs: Observation, instr: str, snr: float | SnrReading | None
@@ -196,8 +207,17 @@ class AsyncComVLAClient:
             response = await self._core.call(self._transport, prepared, remaining_s)
         except TransportError as error:
             self._check_open()
+            if self._core.may_relearn(error):
+                error = await self._relearn(error)
             return self._core.fail(prepared, error, time.perf_counter() - sent)
         return self._core.complete(prepared, response, time.perf_counter() - sent)
+
+    async def _relearn(self, error: TransportError) -> TransportError:
+        """Shakes hands anew with a server whose model was replaced, within another deadline."""
+        try:
+            return self._core.relearn(await self._transport.get_model(self._core.deadline_s))
+        except TransportError:
+            return error
 
     def _check_open(self) -> None:
         if self._closed:

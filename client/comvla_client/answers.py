@@ -10,6 +10,7 @@ from comvla.errors import (
     ComVLAError,
     HandshakeError,
     InstructionError,
+    ModelChangedError,
     ObservationError,
 )
 from comvla.model_info import ModelInfo
@@ -51,8 +52,8 @@ def fallback_reason(error: TransportError) -> FallbackReason:
         error: how the call ended.
 
     Raises:
-        HandshakeError: the server runs another model or protocol, or none of ours: no later step
-            can succeed, so holding would be for ever.
+        HandshakeError: the server runs another protocol, or none of ours: no later step can succeed,
+            so holding would be for ever. ModelChangedError: another model.
         ObservationError, InstructionError, CodecError: the server found the request invalid.
     """
     if any(words in error.message for words in _OVERSIZE):
@@ -64,9 +65,10 @@ def fallback_reason(error: TransportError) -> FallbackReason:
         return _FALLBACKS[error.code]
     if error.code == "INVALID_ARGUMENT":
         words = error.message.lower()
-        kind = next((kind for word, kind in _INVALID if word in words), HandshakeError)
-        raise kind(f"the server refused the request: {error.message}") from error
-    raise HandshakeError(
+        wrong = next((kind for word, kind in _INVALID if word in words), HandshakeError)
+        raise wrong(f"the server refused the request: {error.message}") from error
+    kind = ModelChangedError if error.code == "FAILED_PRECONDITION" else HandshakeError
+    raise kind(
         f"the server cannot serve this robot any more ({error.code}): {error.message}. "
         "It may have been restarted with another model: load the edge half of the checkpoint that "
         "it runs, and make a new client"
@@ -84,7 +86,7 @@ def read_actions(
             later one may be good.
     """
     if response.model_fingerprint and response.model_fingerprint != info.fingerprint:
-        raise HandshakeError(
+        raise ModelChangedError(
             f"expected an answer of {info.name} (fingerprint {info.fingerprint}), got one of "
             f"fingerprint {response.model_fingerprint}: load the edge half of the checkpoint that "
             "the server runs"

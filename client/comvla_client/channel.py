@@ -38,6 +38,9 @@ CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
 )
 
 
+_LOST_REPLICA = ("ActorDiedError", "ActorUnavailableError", "RayActorError", "The actor died")
+
+
 def check_target(target: str) -> str:
     """The address of a server, ``host:port``.
 
@@ -99,9 +102,11 @@ class Attempts:
 
 def transport_error(error: grpc.RpcError) -> TransportError:
     """A failed call in this package's words."""
-    code, details = error.code(), error.details()
-    hints = LoadHints.from_metadata(error.trailing_metadata())
-    return TransportError(code.name, details or "no details", hints)
+    code, details = error.code().name, error.details() or "no details"
+    # Ray's proxy calls it INTERNAL when the replica that it had chosen dies. Another one will answer.
+    if code == "INTERNAL" and any(words in details for words in _LOST_REPLICA):
+        code = "UNAVAILABLE"
+    return TransportError(code, details, LoadHints.from_metadata(error.trailing_metadata()))
 
 
 def is_silence(error: TransportError) -> bool:
@@ -122,6 +127,8 @@ def no_server(target: str, error: TransportError, budget_s: float) -> HandshakeE
             f"found a server at {target}, but {distrust} `comvla doctor` looks closer "
             f"({error.code}: {error.message})"
         )
+    if error.code == "NOT_FOUND":
+        return HandshakeError(f"found a server at {target}, but no such model: {error.message}")
     if error.code == "UNIMPLEMENTED":
         found = "a gRPC server answered that offers no comvla.v1.PolicyService."
     elif _speaks_no_http2(error):

@@ -16,12 +16,14 @@ from comvla_client.edge import EdgeModel
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.observation import Observation
 from comvla_client.queue import Actions
+from comvla_client.reaching import make_transport
 from comvla_client.report import ActionChunk
 from comvla_client.selection import Selector
 from comvla_client.sending import SendingPolicy
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading
-from comvla_client.transport import GrpcTransport, Transport
+from comvla_client.tracing import Tracing, traced
+from comvla_client.transport import Transport
 from comvla_client.uplink import UplinkForm
 
 
@@ -38,7 +40,9 @@ class ComVLAClient:
     from any thread at any time.
 
     Args:
-        target: ``host:port`` of a server, or a transport of your own, which the client then owns.
+        target: ``host:port`` of a server; several that answer alike, with commas between, or a name
+            that stands for them, ``dns:///name:port``; or a transport of your own, which the client
+            then owns.
         edge: the robot's half of the model, e.g. ``comvla_vla.load_edge("mini")``. A robot that sends
             pictures needs none: a ``ModelInfo`` of the model that it expects, or None to take the
             server's word for it.
@@ -73,6 +77,10 @@ class ComVLAClient:
         warm_up: sends filler, as much as the last request, shortly before a query that follows a
             silence: where the machine's TCP cannot be tuned, the query then takes one round trip
             instead of three, for twice the bytes (:mod:`comvla_client.warm_up`).
+        model: name of the model to ask for, where the server has several; empty for its default. A
+            transport of your own has to ask for the same in ``get_model``.
+        tracing: OpenTelemetry traces of every step (:class:`comvla_client.tracing.Tracing`); stays
+            yours to close.
 
     Raises:
         HandshakeError: no ComVLA server at the target in time, one with another model, or one that
@@ -104,6 +112,8 @@ class ComVLAClient:
         token: Token | None = None,
         insecure: bool = False,
         warm_up: bool = False,
+        model: str = "",
+        tracing: Tracing | None = None,
     ) -> None:
         self._core = ClientCore(
             edge,
@@ -120,12 +130,15 @@ class ComVLAClient:
             hold=hold,
             session_id=session_id,
             seed=seed,
+            model=model,
         )
+        self._tracing = tracing
         self._lock = threading.RLock()
         self._closed = False
+        self._transport: Transport
         if isinstance(target, str):
-            self._transport: Transport = GrpcTransport(
-                target, tls, token, insecure=insecure, warm_up=warm_up
+            self._transport = make_transport(
+                target, tls, token, insecure=insecure, warm_up=warm_up, model=model
             )
         else:
             check_unused(tls, token, insecure)
@@ -182,10 +195,16 @@ class ComVLAClient:
         """
         with self._lock:
             self._check_open()
-            prepared = self._core.prepare(obs, instr, snr)
-            if prepared.request is None:
-                return self._core.fail(prepared)
-            return self._call(prepared)
+            with traced(self._tracing) as trace:
+                prepared = self._core.prepare(obs, instr, snr)
+                trace.prepared(prepared)
+                if prepared.request is None:
+                    chunk = self._core.fail(prepared)
+                else:
+                    with trace.call():
+                        chunk = self._call(prepared)
+                trace.done(chunk)
+            return chunk
 
     def act(self, obs: Observation, instr: str, snr: float | SnrReading | None = None) -> Actions:
         """The action for this control period: the next of the chunk, or of a new one.
@@ -251,8 +270,17 @@ class ComVLAClient:
             response = self._core.call(self._transport, prepared, remaining_s)
         except TransportError as error:
             self._check_open()
+            if self._core.may_relearn(error):
+                error = self._relearn(error)
             return self._core.fail(prepared, error, time.perf_counter() - sent)
         return self._core.complete(prepared, response, time.perf_counter() - sent)
+
+    def _relearn(self, error: TransportError) -> TransportError:
+        """Shakes hands anew with a server whose model was replaced, within another deadline."""
+        try:
+            return self._core.relearn(self._transport.get_model(self._core.deadline_s))
+        except TransportError:
+            return error
 
     def _check_open(self) -> None:
         if self._closed:

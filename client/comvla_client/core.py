@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from comvla import codec, handshake
-from comvla.errors import HandshakeError
+from comvla.errors import HandshakeError, ModelChangedError
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
 from comvla_client.advice import BackOff, TokenAdvice
@@ -56,6 +56,7 @@ class Prepared:
         uplink: what is sent; None when nothing is.
         stream: the payload in pieces; ``request`` then has none. None where it goes whole.
         reason: why nothing is sent, where nothing is.
+        planned: when it was decided what to send, on the same clock.
     """
 
     request: InferRequest | None
@@ -66,6 +67,7 @@ class Prepared:
     uplink: Uplink | None = None
     stream: PayloadStream | None = None
     reason: FallbackReason = "no_link"
+    planned: float = 0.0
 
     def remaining_s(self) -> float:
         """Seconds left for the call; negative when the edge half alone took too long."""
@@ -74,6 +76,8 @@ class Prepared:
 
 class ClientCore:
     """State and decisions of one robot's client. Arguments are those of ``ComVLAClient``."""
+
+    queue: ActionQueue
 
     def __init__(
         self,
@@ -92,6 +96,7 @@ class ClientCore:
         hold: Sequence[float] | None = None,
         session_id: str | None = None,
         seed: int = 0,
+        model: str = "",
     ) -> None:
         self._form = make_uplink(uplink, selector)
         self.sending = make_policy(sending)
@@ -105,6 +110,7 @@ class ClientCore:
                 f"sending={self.sending.name!r} has a floor in tokens, {self._form.name} sends pictures: "
                 "choose sending='paper' or 'margin'"
             )
+        self._takes_any = edge is None
         self._edge = None if edge is None or isinstance(edge, ModelInfo) else edge
         if self._form.needs_edge and self._edge is None:
             raise ValueError(
@@ -118,6 +124,7 @@ class ClientCore:
             self._begin(edge if isinstance(edge, ModelInfo) else edge.info)
         self._snr = None if snr is None else as_source(snr)
         self._seed = seed
+        self._model = model
         self._session = _session_name(session_id)
         self._episode = 0
         self._step = 0
@@ -157,7 +164,7 @@ class ClientCore:
         cloud = handshake.from_response(response)
         if self._info is None:
             self._begin(cloud)
-        check_model(cloud, self.info)
+        check_model(cloud, self.info, handshake.edge_fingerprints(response))
         if self.sending.progressive and not response.progressive:
             raise HandshakeError(
                 f"client sends payloads in pieces, server {response.server_version or 'of no version'} "
@@ -165,6 +172,37 @@ class ClientCore:
             )
         self._form.check_server(response)
         return cloud
+
+    def may_relearn(self, error: TransportError) -> bool:
+        """Whether a call ended because the server has another model, and this robot can work with any:
+        it has no half of its own and was told of none."""
+        return error.code == "FAILED_PRECONDITION" and self._takes_any
+
+    def relearn(self, response: GetModelResponse) -> TransportError:
+        """Takes the server's word for its new model.
+
+        Returns:
+            Why the step that found out has no answer; the next one will.
+
+        Raises:
+            ModelChangedError: the robot would have to move otherwise than before.
+        """
+        before, after = self.info, handshake.from_response(response)
+        for name in ("action_dim", "delta_actions", "control_period_s"):
+            if getattr(before, name) != getattr(after, name):
+                raise ModelChangedError(
+                    f"the server has another model now, {after.name}, whose {name} is "
+                    f"{getattr(after, name)}, expected {getattr(before, name)}: make a new client"
+                )
+        queue = self.queue
+        self._info = None
+        self.accept_server(response)
+        if queue.horizon == self.queue.horizon:
+            self.queue = queue  # what the robot holds with is no affair of the server's
+        return TransportError(
+            "ABORTED",
+            f"the server has another model now, {after.name}: the next step asks that one",
+        )
 
     def prepare(
         self, obs: Observation, instruction: str, snr: float | SnrReading | None = None
@@ -182,6 +220,7 @@ class ClientCore:
         plan = self._plan(reading, request)
         report = self._opened(reading, request, plan)
         plan = self._as_advised(plan)
+        planned = time.perf_counter()
         deadline = started + self.deadline_s - min(WIND_UP_S, 0.1 * self.deadline_s)
         rng = np.random.default_rng([self._seed, self._episode, self._step])
         self._step += 1
@@ -189,11 +228,13 @@ class ClientCore:
         if plan.count and pause_s > 0.0:
             words = f"the server is busy: asking again in {pause_s:.3f} s at the earliest"
             plan = replace(plan, count=0, detail=words)
-            return Prepared(None, report, started, deadline, plan, reason="overloaded")
+            return Prepared(
+                None, report, started, deadline, plan, reason="overloaded", planned=planned
+            )
         if plan.count == 0:
             if not self._form.in_pieces:
                 plan = replace(plan, detail="the link carries too few bytes for any picture")
-            return Prepared(None, report, started, deadline, plan)
+            return Prepared(None, report, started, deadline, plan, planned=planned)
         uplink = self._form.compress(checked, plan.count, rng)
         report = replace(
             report,
@@ -204,13 +245,13 @@ class ClientCore:
         )
         if not uplink.sends:
             plan = replace(plan, count=0, detail=uplink.refusal)
-            return Prepared(None, report, started, deadline, plan)
+            return Prepared(None, report, started, deadline, plan, planned=planned)
         stream = None
         if plan.progressive:
             stream = self._stream(request, uplink.payload, len(uplink.positions), plan)
         else:
             uplink.fill(request)
-        return Prepared(request, report, started, deadline, plan, uplink, stream)
+        return Prepared(request, report, started, deadline, plan, uplink, stream, planned=planned)
 
     def call(self, transport: Any, prepared: Prepared, timeout_s: float) -> Any:
         """Hands a step to a transport in the form that its plan asks for; the transport's result.
@@ -487,6 +528,7 @@ class ClientCore:
             proprio=proprio,
             model_fingerprint=self.info.fingerprint,
             protocol_version=PROTOCOL_VERSION,
+            model=self._model,
         )
         if reading is not None and math.isfinite(reading.snr_db):
             request.snr_db, request.snr_age_s = reading.snr_db, reading.age_s

@@ -78,6 +78,8 @@ class GrpcTransport:
         tls: encrypts; None sends in the clear.
         token: says who calls.
         insecure: lets the token cross a network in the clear.
+        model: name of the model to ask for, where the server has several; empty for its default.
+        patient: try UNAVAILABLE again; else it is told at once, for somebody who knows another server.
         warm_up: send filler ahead of a query that follows a silence (:mod:`comvla_client.warm_up`).
 
     Raises:
@@ -92,11 +94,14 @@ class GrpcTransport:
         token: Token | None = None,
         *,
         insecure: bool = False,
+        model: str = "",
+        patient: bool = True,
         warm_up: bool = False,
     ) -> None:
         self.target = target
         self._warm_up = WarmUp(self._send_filler) if warm_up else None
         self._access = Access(target, tls, token, insecure=insecure)
+        self._model, self._patient = model, patient
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._calls = 0
@@ -110,7 +115,7 @@ class GrpcTransport:
             TransportError: no usable answer within ``timeout_s`` seconds.
             ClientClosedError: the transport is closed.
         """
-        request = GetModelRequest(protocol_version=PROTOCOL_VERSION)
+        request = GetModelRequest(protocol_version=PROTOCOL_VERSION, model=self._model)
         answer: GetModelResponse = self._call(_unary("GetModel", request), timeout_s)
         return answer
 
@@ -169,6 +174,11 @@ class GrpcTransport:
         closing.join(_CLOSE_WITHIN_S)
 
     @property
+    def access(self) -> Access:
+        """How the server is reached."""
+        return self._access
+
+    @property
     def filler_bytes(self) -> int:
         """Bytes of filler sent so far, with their frames; 0 without ``warm_up``."""
         return 0 if self._warm_up is None else self._warm_up.sent_bytes
@@ -191,6 +201,10 @@ class GrpcTransport:
             try:
                 answer = self._attempt(start, attempts.remaining_s())
             except TransportError as error:
+                if not self._patient:
+                    if error.code == "UNAVAILABLE":
+                        self._renew()
+                    raise
                 if self._closed.wait(attempts.pause_s(error)):
                     raise self._closed_error() from error
                 self._renew()

@@ -57,6 +57,8 @@ class GrpcAioTransport:
         tls: encrypts; None sends in the clear.
         token: says who calls.
         insecure: lets the token cross a network in the clear.
+        model: name of the model to ask for, where the server has several; empty for its default.
+        patient: try UNAVAILABLE again; else it is told at once, for somebody who knows another server.
 
     Raises:
         HandshakeError: the target is no such address.
@@ -70,12 +72,20 @@ class GrpcAioTransport:
         token: Token | None = None,
         *,
         insecure: bool = False,
+        model: str = "",
+        patient: bool = True,
     ) -> None:
         self.target = target
         self._access = Access(target, tls, token, insecure=insecure)
+        self._model, self._patient = model, patient
         self._closed = asyncio.Event()
         self._revival = AsyncRevival(self._access.aio_channel, self._access.metadata)
         self._channel: grpc.aio.Channel | None = None
+
+    @property
+    def access(self) -> Access:
+        """How the server is reached."""
+        return self._access
 
     async def get_model(self, timeout_s: float) -> GetModelResponse:
         """The server's description of its model; waits for one that is still starting.
@@ -84,7 +94,7 @@ class GrpcAioTransport:
             TransportError: no usable answer within ``timeout_s`` seconds.
             ClientClosedError: the transport is closed.
         """
-        request = GetModelRequest(protocol_version=PROTOCOL_VERSION)
+        request = GetModelRequest(protocol_version=PROTOCOL_VERSION, model=self._model)
         answer: GetModelResponse = await self._call(_unary("GetModel", request), timeout_s)
         return answer
 
@@ -113,6 +123,11 @@ class GrpcAioTransport:
         answer: InferResponse = (await self._call(start, timeout_s)).response
         return answer
 
+    async def renew(self) -> None:
+        """Makes the next call over a new connection; ends those under way."""
+        if not self._closed.is_set():
+            self._replace(self._access.aio_channel())
+
     async def close(self) -> None:
         """Ends calls under way with ClientClosedError. Closing twice does no harm."""
         self._closed.set()
@@ -127,6 +142,10 @@ class GrpcAioTransport:
             try:
                 return await self._attempt(start, attempts.remaining_s())
             except TransportError as error:
+                if not self._patient:
+                    if error.code == "UNAVAILABLE":
+                        await self.renew()
+                    raise
                 await asyncio.sleep(attempts.pause_s(error))
                 if not self._closed.is_set():
                     self._replace(self._access.aio_channel())

@@ -36,5 +36,9 @@ class HandshakeError(ComVLAError):
     """Robot and server differ in model or protocol; raised before the robot moves."""
 
 
+class ModelChangedError(HandshakeError):
+    """The server runs another model by now: make a new client, with the edge half of that model."""
+
+
 class DependencyError(ComVLAError, ImportError):
     """An optional part (simulator, GL library, torch) is missing; the message says what to do."""

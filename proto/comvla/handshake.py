@@ -49,6 +49,7 @@ def to_response(
     image_codings: Sequence[str] = (),
     progressive: bool = False,
     run_options: Sequence[str] = (),
+    edge_fingerprints: Sequence[str] = (),
 ) -> policy_pb2.GetModelResponse:
     """The server's answer to ``GetModel``.
 
@@ -61,6 +62,7 @@ def to_response(
             robot has to see for itself.
         progressive: whether it answers ``InferProgressive``.
         run_options: how the model is run where that changes its answers, e.g. :data:`COMPACT_POSITIONS`.
+        edge_fingerprints: of other models with the same edge half, whose robots are answered too.
 
     Raises:
         ValueError: a quantization or picture coding that the protocol does not know.
@@ -86,6 +88,7 @@ def to_response(
         image_codings=[coding_number(name) for name in image_codings],
         progressive=progressive,
         run_options=run_options,
+        edge_fingerprints=edge_fingerprints,
     )
 
 
@@ -176,11 +179,21 @@ def run_options(response: policy_pb2.GetModelResponse) -> tuple[str, ...]:
     return tuple(option for option in response.run_options[:_MOST_OPTIONS] if _is_text(option))
 
 
-def mismatch(edge: ModelInfo, cloud: ModelInfo) -> str | None:
+def edge_fingerprints(response: policy_pb2.GetModelResponse) -> tuple[str, ...]:
+    """Fingerprints of other models with the same edge half, whose robots the server answers too."""
+    return tuple(text for text in response.edge_fingerprints[:_MOST_OPTIONS] if _is_text(text))
+
+
+def mismatch(edge: ModelInfo, cloud: ModelInfo, also: Iterable[str] = ()) -> str | None:
     """The first difference between the robot's half and the server's, in words with a remedy.
 
     Sizes come before the fingerprint, because they say more. Names may differ: one checkpoint can
     lie in two folders.
+
+    Args:
+        edge: the robot's half.
+        cloud: the server's.
+        also: fingerprints that will do as well as the server's own (:func:`edge_fingerprints`).
 
     Returns:
         None where the halves belong together.
@@ -192,7 +205,7 @@ def mismatch(edge: ModelInfo, cloud: ModelInfo) -> str | None:
                 f"server expects {field} {_words(expected)} ({cloud.name}), client sends "
                 f"{_words(came)} ({edge.name}): load the edge half of the same checkpoint"
             )
-    if edge.fingerprint != cloud.fingerprint:
+    if edge.fingerprint not in (cloud.fingerprint, *also):
         return (
             f"server expects fingerprint {cloud.fingerprint} ({cloud.name}), client sends "
             f"{edge.fingerprint} ({edge.name}): the sizes agree, the weights do not; load the edge "

@@ -1,4 +1,5 @@
-"""The admin surface: what operators, probes and Prometheus ask over HTTP. Read only."""
+"""The admin surface: what operators, probes and Prometheus ask over HTTP. Read only;
+what changes something is in :mod:`comvla_server.admin_models`."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from comvla_server.fleet_feed import FleetFeed
 from comvla_server.fleet_page import add_page
 from comvla_server.lifecycle import Lifecycle, Phase
 from comvla_server.metrics import Metrics
-from comvla_server.service import PolicyService, Runtime
+from comvla_server.models import Models, Runtime
+from comvla_server.service import PolicyService
 from comvla_server.settings import ServerSettings
 from comvla_server.version import server_version
 
@@ -108,7 +110,7 @@ def create_app(
 
     @app.get("/healthz", summary="Liveness: restart the process when this fails")
     async def healthz(response: Response) -> Liveness:
-        if service.runtime is not None and lifecycle.ready and not service.runtime.batcher.alive:
+        if lifecycle.ready and not all(r.batcher.alive for r in service.models):
             response.status_code = 503
             return Liveness(status="the dispatcher has died: restart the server")
         if lifecycle.phase is Phase.STOPPED:
@@ -127,7 +129,8 @@ def create_app(
 
     @app.get("/v1/sessions", summary="Robots seen lately")
     async def sessions(limit: Annotated[int, Query(ge=1, le=10_000)] = 100) -> SessionList:
-        return _describe_sessions(loaded(), limit)
+        loaded()
+        return _describe_sessions(service.models, limit)
 
     @app.get("/metrics", summary="Prometheus exposition", response_class=Response)
     async def prometheus(request: Request) -> Response:
@@ -163,9 +166,11 @@ def _describe_model(runtime: Runtime, settings: ServerSettings) -> ModelDescript
     )
 
 
-def _describe_sessions(runtime: Runtime, limit: int) -> SessionList:
+def _describe_sessions(models: Models, limit: int) -> SessionList:
     now_s = time.monotonic()
-    known = runtime.batcher.sessions
+    known = [session for runtime in models for session in runtime.batcher.sessions]
+    if len(models) > 1:
+        known.sort(key=lambda session: session.last_seen_s)
     return SessionList(
         count=len(known),
         sessions=[

@@ -5,10 +5,10 @@ from __future__ import annotations
 import base64
 import binascii
 from collections.abc import Awaitable, Callable, Iterable
-from functools import partial
 from typing import Any
 
 from comvla_server.auth import bearer_token
+from comvla_server.identity import MAY_SWAP, Identity
 from comvla_server.tokens import TokenFile
 
 ADMITTED = "comvla_admitted"
@@ -19,6 +19,10 @@ at length asks it now and then, so that a token that was taken away ends with wh
 _OPEN = frozenset({"/healthz", "/readyz"})
 
 _REFUSED = b"expected a token of the admin tokens file: `comvla-server token new` makes one\n"
+
+__all__ = ["MAY_SWAP", "AdminAuth", "Asgi", "rights_of"]
+
+_OPERATOR = "comvla.operator"
 
 Asgi = Callable[[Any, Any, Any], Awaitable[None]]
 
@@ -42,8 +46,11 @@ class AdminAuth:
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Passes on, or answers 401."""
-        if scope["type"] == "lifespan" or scope.get("path") in self._open or self._known(scope):
-            scope[ADMITTED] = partial(self._known, scope)
+        operator = None if scope["type"] == "lifespan" else self._operator(scope)
+        if operator is not None:
+            scope[_OPERATOR] = operator
+        if scope["type"] == "lifespan" or scope.get("path") in self._open or operator is not None:
+            scope[ADMITTED] = lambda: self._operator(scope) is not None
             await self._app(scope, receive, send)
             return
         headers = [
@@ -55,10 +62,16 @@ class AdminAuth:
         await send({"type": "http.response.start", "status": 401, "headers": headers})
         await send({"type": "http.response.body", "body": _REFUSED})
 
-    def _known(self, scope: Any) -> bool:
+    def _operator(self, scope: Any) -> Identity | None:
         given = [value for name, value in scope["headers"] if name == b"authorization"]
         token = _token(given[0]) if len(given) == 1 else None
-        return token is not None and self._tokens.find(token) is not None
+        return None if token is None else self._tokens.find(token)
+
+
+def rights_of(scope: Any) -> frozenset[str]:
+    """What whoever sends a request may do; nothing where nobody was asked who they are."""
+    operator = scope.get(_OPERATOR)
+    return operator.rights if isinstance(operator, Identity) else frozenset()
 
 
 def _token(value: bytes) -> str | None:

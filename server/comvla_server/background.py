@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable
+from collections.abc import Mapping
 from concurrent.futures import Future
+from functools import partial
 from types import TracebackType
+from typing import Any
 
-from comvla_server.engine import Engine
+from comvla_server.bring_up import EngineSource
 from comvla_server.server import Server
 from comvla_server.settings import ServerSettings
 
@@ -21,15 +23,18 @@ class BackgroundServer:
         ...     client = ComVLAClient(server.target, edge=edge)
 
     Args:
-        engine: the model, or a function that loads it.
+        engine: the model, a function that loads it, or several by name.
         settings: free ports on this machine where None.
+        options: further ones of :class:`Server`.
     """
 
     def __init__(
-        self, engine: Engine | Callable[[], Engine], settings: ServerSettings | None = None
+        self,
+        engine: EngineSource | Mapping[str, EngineSource],
+        settings: ServerSettings | None = None,
+        **options: Any,
     ) -> None:
-        self._engine = engine
-        self._settings = settings
+        self._make = partial(Server, engine, settings, **options)
         self._started: Future[tuple[Server, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
         self._grace_s: float | None = None
         self._finished = False
@@ -98,7 +103,8 @@ class BackgroundServer:
             self._started.set_exception(error)
 
     async def _serve(self) -> None:
-        server = Server(self._engine, self._settings)
+        server = self._make()
+        del self._make  # a model that is replaced must not be held here
         stop = asyncio.Event()
         await server.start()
         self._started.set_result((server, asyncio.get_running_loop(), stop))

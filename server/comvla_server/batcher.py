@@ -116,6 +116,10 @@ class Batcher:
         """Sessions on record, least recently seen first."""
         return list(self._sessions)
 
+    def adopt_sessions(self, before: Batcher) -> None:
+        """Goes on with the sessions of the model that this one replaces."""
+        self._sessions.adopt(before._sessions)
+
     def find(self, session_id: str, step: int, digest: bytes) -> Ticket | None:
         """The ticket of a step that is waiting, running or on record; None for a new step.
 

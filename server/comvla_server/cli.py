@@ -10,8 +10,10 @@ from comvla.errors import ComVLAError
 from comvla_server import (
     config_command,
     inspect_command,
+    ray_command,
     serve_command,
     split_command,
+    swap_command,
     token_command,
 )
 from comvla_server.version import server_version
@@ -30,6 +32,7 @@ examples:
   comvla-server config --max-batch 4            every setting in force, and where it came from
   comvla-server token new arm-7 --file tokens   a token for the robot arm-7
   comvla-server inspect mini                    what a checkpoint is and what a step costs
+  comvla-server swap /models/next --token-file T  another checkpoint, without a failed call
   comvla-server split SRC DST --check           halves of a published checkpoint
   curl http://127.0.0.1:8080/metrics            what Prometheus scrapes
 
@@ -49,9 +52,11 @@ def build_parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     serve_command.add_parser(subparsers)
     config_command.add_parser(subparsers)
+    ray_command.add_parser(subparsers)
     token_command.add_parser(subparsers)
     inspect_command.add_parser(subparsers)
     split_command.add_parser(subparsers)
+    swap_command.add_parser(subparsers)
     return parser
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from comvla_server.model_names import parse_models
 from comvla_server.ports import is_loopback
 from comvla_server.setting_fields import SettingsError
 
@@ -21,6 +22,7 @@ def check_together(settings: ServerSettings) -> None:
     _check_network(settings)
     _check_tls(settings)
     _check_access(settings)
+    _check_traces(settings)
     least = settings.max_queue + settings.max_batch
     if settings.max_sessions < least:
         raise SettingsError(
@@ -36,6 +38,7 @@ def check_together(settings: ServerSettings) -> None:
 
 
 def _check_model(settings: ServerSettings) -> None:
+    parse_models(settings.model)
     if settings.fastv is not None:
         layer, drop = settings.fastv
         if layer < 1 or not 0 <= drop < 1:
@@ -97,4 +100,17 @@ def _check_access(settings: ServerSettings) -> None:
         raise SettingsError(
             f"tokens_file and admin_tokens_file are both {settings.tokens_file}: a robot's token "
             "must not open the admin surface, so keep two files"
+        )
+
+
+def _check_traces(settings: ServerSettings) -> None:
+    if settings.otel_sample > 1.0:
+        raise SettingsError(
+            f"otel_sample must be a share from 0 to 1, got {settings.otel_sample:g}"
+        )
+    endpoint = settings.otel_endpoint
+    if endpoint is not None and not endpoint.startswith(("http://", "https://")):
+        raise SettingsError(
+            f"otel_endpoint must be a collector's OTLP/HTTP address, e.g. "
+            f"http://127.0.0.1:4318/v1/traces, got {endpoint!r}"
         )

@@ -47,21 +47,25 @@ class Engine:
     Args:
         cloud: the cloud half.
         vision: the vision half of the same model, for robots that send pictures; None reads tokens only.
+        edge_identity: digest over the edge half that goes with it, where the checkpoint says.
 
     Attributes:
         info: description of the model.
-        vision: as given.
+        vision, edge_identity: as given.
         costs: what forward passes take, learned from the warm-up on.
 
     Raises:
         HandshakeError: vision and cloud half are of different models.
     """
 
-    def __init__(self, cloud: CloudHalf, vision: Vision | None = None) -> None:
+    def __init__(
+        self, cloud: CloudHalf, vision: Vision | None = None, edge_identity: str | None = None
+    ) -> None:
         self._cloud = cloud
         self.info = cloud.info
         self.vision = vision
         self.costs = CostModel()
+        self.edge_identity = edge_identity
         if vision is not None:
             difference = handshake.mismatch(vision.info, cloud.info)
             if difference is not None:

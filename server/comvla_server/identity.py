@@ -6,6 +6,11 @@ import re
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
+MAY_SWAP = "may_swap"
+"""Right of an operator: to replace a model that serves."""
+
+RIGHTS = (MAY_SWAP,)
+
 IDENTITY_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@/+-]{0,99}")
 
 
@@ -31,10 +36,12 @@ class Identity:
     Attributes:
         name: empty where the server asks nobody who they are.
         limits: its own.
+        rights: what an operator may do beside looking, :data:`MAY_SWAP`.
     """
 
     name: str
     limits: Limits = field(default_factory=Limits)
+    rights: frozenset[str] = frozenset()
 
 
 ANYBODY = Identity("")

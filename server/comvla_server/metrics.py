@@ -132,6 +132,18 @@ class Metrics:
             ["certificate"],
             registry=self.registry,
         )
+        self.model_requests = Counter(
+            "comvla_model_requests",
+            "Infer and InferProgressive calls by model and by whether it answered: ok, repeat, refused.",
+            ["model", "outcome"],
+            registry=self.registry,
+        )
+        self._model_queue_depth = Gauge(
+            "comvla_model_queue_depth",
+            "Requests that wait for one model.",
+            ["model"],
+            registry=self.registry,
+        )
         # Every series exists from the start: a rate over a late one loses its first step.
         for reason in Reason:
             self.requests_dropped.labels(reason.value)
@@ -193,6 +205,17 @@ class Metrics:
         self._utilization.set_function(utilization)
         self._sessions.set_function(sessions)
 
+    def watch_model(self, model: str, queue_depth: Callable[[], float]) -> None:
+        """Tells a model apart from others from now on, by a name that the operator chose.
+
+        Args:
+            model: its name.
+            queue_depth: read at every scrape.
+        """
+        for outcome in ("ok", "repeat", "refused"):
+            self.model_requests.labels(model, outcome)
+        self._model_queue_depth.labels(model).set_function(queue_depth)
+
     def watch_bytes(self, in_flight: Callable[[], float]) -> None:
         """Reads the bytes in flight at every scrape."""
         self._in_flight.set_function(in_flight)
@@ -216,6 +239,10 @@ class Metrics:
         self._model_info.labels(
             info.name, info.fingerprint, str(PROTOCOL_VERSION), server_version
         ).set(1)
+
+    def forget_model(self, info: ModelInfo, server_version: str) -> None:
+        """Takes back a model that answers no more."""
+        self._model_info.remove(info.name, info.fingerprint, str(PROTOCOL_VERSION), server_version)
 
     def _counter(self, name: str, text: str) -> Counter:
         return Counter(name, text, registry=self.registry)

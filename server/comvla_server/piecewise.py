@@ -33,7 +33,6 @@ class PieceReader:
 
     Args:
         messages: parsed messages; anything that is no ``InferProgressiveRequest`` did not parse.
-        info: the model; no payload of its tokens is larger than all of them in the widest coding.
         on_message: called with each message before it is looked at; may raise Refusal.
         clock: monotonic seconds.
 
@@ -45,12 +44,12 @@ class PieceReader:
     def __init__(
         self,
         messages: AsyncIterator[Any],
-        info: ModelInfo,
         on_message: Callable[[policy_pb2.InferProgressiveRequest], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._messages = messages
-        self._info = info
+        self._info: ModelInfo | None = None
+        self._min_tokens = 0
         self._on_message = on_message
         self._clock = clock
         self.ending: Ending = "refused"
@@ -82,12 +81,28 @@ class PieceReader:
         self._check(head)
         return head
 
-    async def collect(self, window_s: float, min_tokens: int) -> bytes:
+    def expect(self, info: ModelInfo, min_tokens: int) -> None:
+        """Says what the pieces are of; comes before :meth:`collect`.
+
+        Args:
+            info: the model; no payload of its tokens is larger than all of them in the widest coding.
+            min_tokens: whole tokens that have to be there.
+
+        Raises:
+            Refusal: more than the model has.
+        """
+        if min_tokens > info.num_tokens:
+            raise _invalid(
+                f"expected min_tokens of at most {info.num_tokens}, got {min_tokens}: "
+                "no observation has more"
+            )
+        self._info, self._min_tokens = info, min_tokens
+
+    async def collect(self, window_s: float) -> bytes:
         """The payload, or as much of it as came in time.
 
         Args:
             window_s: seconds from now in which pieces count.
-            min_tokens: whole tokens that have to be there.
 
         Raises:
             Refusal: too little came, or something that is no piece of one payload.
@@ -109,7 +124,7 @@ class PieceReader:
             announced = self._announced()
         else:
             self.ending = "whole"
-        self._require(max(1, min_tokens), window_s)
+        self._require(max(1, self._min_tokens), window_s)
         return bytes(self.payload)
 
     async def _next(self, patience_s: float) -> policy_pb2.InferProgressiveRequest | None:
@@ -151,6 +166,7 @@ class PieceReader:
             Refusal: it is not one of this model, or more came than it announces.
         """
         info, came = self._info, len(self.payload)
+        assert info is not None, "expect() comes first"
         try:
             header = codec.read_header(self.payload)
         except CodecError as error:
@@ -187,11 +203,6 @@ class PieceReader:
             raise _invalid(
                 f"expected a window_s above 0 and at most {MAX_WINDOW_S:g} seconds, got "
                 f"{window_s}: it is the time that the payload has to cross"
-            )
-        if head.min_tokens > self._info.num_tokens:
-            raise _invalid(
-                f"expected min_tokens of at most {self._info.num_tokens}, got {head.min_tokens}: "
-                "no observation has more"
             )
         if head.request.payload:
             raise _invalid(

@@ -14,6 +14,7 @@ class Reason(str, Enum):
     MALFORMED = "malformed"  # bytes that are no message of the contract
     INVALID = "invalid"  # shape, positions, non-finite values, instruction, proprioception
     CONFLICT = "conflict"  # a step that was already sent with other content
+    UNKNOWN_MODEL = "unknown_model"  # a model by a name that nothing is served under
     MISMATCH = "mismatch"  # another model or another protocol
     OVERSIZE = "oversize"  # message larger than the cap
     OVERLOAD = "overload"  # queue full, or too many bytes in flight

@@ -6,18 +6,25 @@ import argparse
 import asyncio
 import contextlib
 import gc
+import logging
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from comvla.errors import ComVLAError
 from comvla_server import logs
 from comvla_server.descriptors import allow_descriptors
+from comvla_server.model_loading import load_engine
 from comvla_server.settings import ServerSettings
 from comvla_server.settings_flags import add_flags, settings_of
 
+_log = logging.getLogger(__name__)
+
 if TYPE_CHECKING:  # torch takes seconds to import: --help does without it
     from comvla_server.engine import Engine
+    from comvla_server.server import Server
 
 _DESCRIPTION = """\
 Serve a policy until SIGTERM or Ctrl-C.
@@ -26,7 +33,8 @@ One line on stdout says when the server is ready and where:
   comvla-server ready grpc=127.0.0.1:50051 admin=http://127.0.0.1:8080 model=comvla-mini
 
 The first signal drains: health says NOT_SERVING, new calls are answered UNAVAILABLE, calls in
-flight finish. A second signal exits at once.
+flight finish. A second signal exits at once. SIGHUP looks for new certificates, tokens and
+checkpoints, and swaps to those without a failed call.
 
 Settings come from flags, from the environment (COMVLA_MAX_BATCH=4), from a file (--config) or from
 defaults, in this order; `comvla-server config` shows which.
@@ -57,69 +65,32 @@ def run(args: argparse.Namespace) -> int:
     settings = settings_of(args).settings
     logs.configure(settings.log_format, settings.log_level)
     allow_descriptors(settings)
-    return asyncio.run(_serve(settings, lambda: load_engine(settings)))
+    loads = {
+        name: partial(load_engine, settings, source) for name, source in settings.models.items()
+    }
+    return asyncio.run(_serve(settings, loads))
 
 
-def load_engine(settings: ServerSettings) -> Engine:
-    """The cloud half of the checkpoint that the settings name, ready to run.
-
-    With the vision half where that is wanted.
-
-    Raises:
-        CheckpointError: missing, damaged, foreign or incomplete.
-    """
-    import torch
-
-    from comvla_server.engine import Engine
-    from comvla_server.vision import holds_whole, load_vision
-    from comvla_vla import CloudOptions, FastV, load_cloud
-
-    if settings.threads is not None:
-        torch.set_num_threads(settings.threads)
-    options = CloudOptions(
-        fastv=None if settings.fastv is None else FastV(*settings.fastv),
-        compact_positions=settings.compact_positions,
-        compile=settings.compile,
-    )
-    cloud = load_cloud(
-        settings.model,
-        device=settings.device,
-        dtype=getattr(torch, settings.dtype),
-        statistics_key=settings.statistics_key,
-        options=options,
-        verify=settings.verify,
-    )
-    wanted = settings.vision == "on" or (settings.vision == "auto" and holds_whole(settings.model))
-    if not wanted:
-        return Engine(cloud)
-    vision = load_vision(
-        settings.model, cloud, settings.device, statistics_key=settings.statistics_key
-    )
-    return Engine(cloud, vision)
-
-
-async def _serve(settings: ServerSettings, load: Callable[[], Engine]) -> int:
+async def _serve(settings: ServerSettings, loads: Mapping[str, Callable[[], Engine]]) -> int:
     from comvla_server.server import Server
 
     stop = _stop_on_signals()
-    server = Server(load, settings)
+    server = Server(loads, settings, sources=settings.models)
     await server.bind()
-    ready = asyncio.create_task(server.make_ready())
+    ready = asyncio.create_task(server.make_ready(_settle))
     stopping = asyncio.create_task(stop.wait())
     lost = asyncio.create_task(server.port_lost.wait())
     try:
         await asyncio.wait({ready, stopping}, return_when=asyncio.FIRST_COMPLETED)
         if ready.done():
             info = ready.result()
-            # What was loaded stays: a garbage collection that walks through all of torch would halt
-            # every robot for a quarter of a second, once in some hundred requests.
-            gc.collect()
-            gc.freeze()
+            names = "".join(f" serves={name}" for name in settings.models if name)
             print(
                 f"comvla-server ready grpc={server.target} admin={server.admin_url} "
-                f"model={info.name}",
+                f"model={info.name}{names}",
                 flush=True,
             )
+            _refresh_on_hangup(server)
             await asyncio.wait({stopping, lost}, return_when=asyncio.FIRST_COMPLETED)
     finally:
         ready.cancel()
@@ -129,6 +100,13 @@ async def _serve(settings: ServerSettings, load: Callable[[], Engine]) -> int:
         with contextlib.suppress(asyncio.CancelledError):
             await ready
     return 0 if finished and not server.port_lost.is_set() else 1
+
+
+def _settle() -> None:
+    """What was loaded stays: a garbage collection that walks through all of torch would halt every
+    robot for a quarter of a second, once in some hundred requests. So would this one, if it came later."""
+    gc.collect()
+    gc.freeze()
 
 
 def _stop_on_signals() -> asyncio.Event:
@@ -146,3 +124,25 @@ def _stop_on_signals() -> asyncio.Event:
         with contextlib.suppress(NotImplementedError):
             loop.add_signal_handler(number, on_signal, number)
     return stop
+
+
+def _refresh_on_hangup(server: Server) -> None:
+    """SIGHUP: certificates, tokens and checkpoints that have changed are taken over."""
+    under_way: set[asyncio.Task[None]] = set()
+
+    async def refresh() -> None:
+        server.reload()
+        try:
+            if not await server.swapper.refresh():
+                _log.info("no checkpoint has changed")
+        except ComVLAError as error:
+            _log.error("the models that serve go on: %s", error)
+
+    def on_hangup() -> None:
+        task = asyncio.ensure_future(refresh())
+        under_way.add(task)
+        task.add_done_callback(under_way.discard)
+
+    if hasattr(signal, "SIGHUP"):
+        with contextlib.suppress(NotImplementedError):
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, on_hangup)

@@ -5,31 +5,30 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import grpc
 
-from comvla import codec
 from comvla.model_info import ModelInfo
 from comvla_server.access import Access
 from comvla_server.admin import create_app
 from comvla_server.admin_http import AdminHttp
-from comvla_server.batcher import Batcher
-from comvla_server.decoding import Decoding
-from comvla_server.engine import Engine
+from comvla_server.admin_models import add_model_routes
+from comvla_server.bring_up import EngineSource, bring_up
 from comvla_server.fleet_feed import FleetFeed
 from comvla_server.grpc_adapter import HealthReporter, add_policy_service, make_grpc_server
 from comvla_server.grpc_port import start_watched
-from comvla_server.inference_thread import InferenceThread
 from comvla_server.lifecycle import Lifecycle, Phase
-from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
+from comvla_server.model_loading import CheckpointLoader, Loader
+from comvla_server.model_names import UNNAMED
 from comvla_server.ports import add_grpc_port, authority, listen
+from comvla_server.runtimes import Runtimes
 from comvla_server.server_state import server_state
-from comvla_server.service import PolicyService, Runtime
-from comvla_server.settings import ServerSettings, SettingsError
-from comvla_server.validation import Validator
-from comvla_server.version import server_version
+from comvla_server.service import PolicyService
+from comvla_server.settings import ServerSettings
+from comvla_server.swapping import Swapper
+from comvla_server.tracing import Tracing
 
 __all__ = ["Server", "ServerSettings"]
 
@@ -37,8 +36,6 @@ _log = logging.getLogger(__name__)
 
 # Time for responses already written to leave the sockets, and for health watchers to be cut.
 _FLUSH_S = 1.0
-# Envelope of a request around its payload: identifiers, instruction, proprioception.
-_ENVELOPE_BYTES = 16 * 1024
 
 
 class Server:
@@ -46,8 +43,12 @@ class Server:
 
     Args:
         engine: the model, or a function that loads it; a function runs in the inference thread
-            after the ports are taken, so that probes see a server that loads.
+            after the ports are taken, so that probes see a server that loads. Several models by
+            the names under which robots ask for them, the default first.
         settings: see :class:`ServerSettings`.
+        sources: the checkpoint behind each name, where it is known; for swaps.
+        loader: finds and loads the checkpoints of swaps; as the settings say where None.
+        tracing: makes traces of calls; as the settings say where None.
 
     Attributes:
         lifecycle: where the server stands.
@@ -58,7 +59,13 @@ class Server:
     """
 
     def __init__(
-        self, engine: Engine | Callable[[], Engine], settings: ServerSettings | None = None
+        self,
+        engine: EngineSource | Mapping[str, EngineSource],
+        settings: ServerSettings | None = None,
+        *,
+        sources: Mapping[str, str] | None = None,
+        loader: Loader | None = None,
+        tracing: Tracing | None = None,
     ) -> None:
         self.settings = settings or ServerSettings()
         self.lifecycle = Lifecycle()
@@ -66,7 +73,11 @@ class Server:
         self.port = 0
         self.admin_port = 0
         self.port_lost = asyncio.Event()
-        self._engine = engine
+        self._sources = dict(engine) if isinstance(engine, Mapping) else {UNNAMED: engine}
+        self._checkpoints = dict(sources or {})
+        self._loader = loader or CheckpointLoader(self.settings)
+        self._swapper: Swapper | None = None
+        self._tracing = tracing
         self._health = HealthReporter()
         self._service: PolicyService | None = None
         self._grpc: grpc.aio.Server | None = None
@@ -74,8 +85,7 @@ class Server:
         self._feed: FleetFeed | None = None
         self._access: Access | None = None
         self._watching: list[asyncio.Task[None]] = []
-        self._thread: InferenceThread | None = None
-        self._decode_thread: InferenceThread | None = None
+        self._runtimes: Runtimes | None = None
 
     @property
     def target(self) -> str:
@@ -111,8 +121,10 @@ class Server:
         """
         settings = self.settings
         access = Access(settings, self.metrics)
+        if self._tracing is None:
+            self._tracing = Tracing.of(settings)
         server = make_grpc_server(settings, [access.door])
-        service = PolicyService(self.lifecycle, self.metrics, settings)
+        service = PolicyService(self.lifecycle, self.metrics, settings, tracing=self._tracing)
         access.door.glance = service.glance
         access.door.on_lost = lambda: service.loop_watch.note(died=True)
         add_policy_service(server, service)
@@ -130,8 +142,9 @@ class Server:
         self.metrics.watch_ready(lambda: self.lifecycle.ready)
         state = server_state(self.lifecycle, self.metrics, service)
         self._feed = feed = FleetFeed(service.fleet, state)
-        app = access.guard(create_app(self.lifecycle, self.metrics, service, settings, feed))
-        self._admin = AdminHttp(app, admin_socket, settings, access.https_context())
+        app = create_app(self.lifecycle, self.metrics, service, settings, feed)
+        add_model_routes(app, service.models, lambda: self._swapper, settings)
+        self._admin = AdminHttp(access.guard(app), admin_socket, settings, access.https_context())
         self._admin.start()
         await start_watched(server, self._lose_port)
         self._access = access
@@ -140,53 +153,49 @@ class Server:
             asyncio.create_task(service.loop_watch.run()),
         ]
 
-    async def make_ready(self) -> ModelInfo:
+    async def make_ready(self, before: Callable[[], object] | None = None) -> ModelInfo:
         """Loads and warms up in the inference thread, then says SERVING.
 
+        Args:
+            before: called once everything is loaded and warm, before the first call is answered.
+
         Returns:
-            Description of the model.
+            Description of the default model.
 
         Raises:
             SettingsError: max_request_bytes cannot hold an unpruned observation of this model.
             Exception: whatever loading or the first forward passes raise.
         """
         assert self._service is not None, "bind() comes first"
-        self._thread = thread = InferenceThread()
-        load = self._engine
-        engine = load if isinstance(load, Engine) else await thread.run(load)
-        self._check_message_cap(engine)
-        self.lifecycle.enter(Phase.WARMING)
-        await thread.run(engine.warm_up, self.settings.max_batch)
-        if self.lifecycle.phase is not Phase.WARMING:
-            return engine.info  # stopped meanwhile
-        settings = self.settings
-        batcher = Batcher(
-            engine,
-            max_batch=settings.max_batch,
-            max_queue=settings.max_queue,
-            max_sessions=settings.max_sessions,
-            session_ttl_s=settings.session_ttl_s,
-            load=LoadPolicy.of(settings),
+        self._runtimes = runtimes = Runtimes(self.settings, self.metrics)
+        sources, self._sources = self._sources, {}  # a model that is replaced must not be held here
+        models = self._service.models
+        info = await bring_up(
+            sources,
+            models,
+            runtimes,
+            lifecycle=self.lifecycle,
             metrics=self.metrics,
-            thread=thread,
+            settings=self.settings,
         )
-        batcher.start()
-        self.metrics.describe_model(engine.info, server_version())
-        self.metrics.watch(
-            queue_depth=lambda: batcher.queue_depth,
-            utilization=lambda: batcher.utilization,
-            sessions=lambda: len(batcher.sessions),
-            offered_load=lambda: batcher.offered_load,
-            suggested_tokens=lambda: batcher.suggested_tokens,
+        del sources
+        if self.lifecycle.phase is not Phase.WARMING:
+            return info  # stopped meanwhile
+        self._swapper = Swapper(
+            models,
+            runtimes,
+            self._loader,
+            self.lifecycle,
+            self.metrics,
+            self.settings,
+            self._checkpoints,
         )
-        validator = Validator(engine, settings.max_request_bytes)
-        self._decode_thread = InferenceThread("comvla-decode")
-        decoding = Decoding(self._decode_thread, settings.max_queue)
-        self._service.runtime = Runtime(engine, batcher, validator, decoding)
+        if before is not None:
+            before()
         self.lifecycle.enter(Phase.SERVING)
         await self._health.serving()
-        _log.info("serving %s", engine.info.name, extra={"grpc": self.target})
-        return engine.info
+        _log.info("serving %s", info.name, extra={"grpc": self.target})
+        return info
 
     def _lose_port(self) -> None:
         """Robots are not answered any more, and will not be: /healthz and /readyz say so."""
@@ -197,6 +206,12 @@ class Server:
         """Looks now for certificates and tokens that have changed, instead of a little later."""
         if self._access is not None:
             self._access.look()
+
+    @property
+    def swapper(self) -> Swapper:
+        """Replaces models; there once the server is ready."""
+        assert self._swapper is not None, "make_ready() comes first"
+        return self._swapper
 
     async def stop(self, grace_s: float | None = None) -> bool:
         """Drains and stops: refuses new calls, lets those in flight finish, then closes the ports.
@@ -210,6 +225,10 @@ class Server:
         self.lifecycle.enter(Phase.DRAINING)
         await self._health.draining()
         finished = await self._drain(self.settings.grace_s if grace_s is None else grace_s)
+        if self._swapper is not None:
+            self._swapper.close()
+        if self._tracing is not None:
+            await asyncio.to_thread(self._tracing.close)
         if self._grpc is not None:
             # A server whose loop has ended raises what ended it.
             with contextlib.suppress(UnicodeDecodeError):
@@ -220,10 +239,8 @@ class Server:
             await self._admin.stop()
         for task in self._watching:
             task.cancel()
-        if self._thread is not None:
-            self._thread.close(timeout_s=1.0 if finished else 0.0)
-        if self._decode_thread is not None:
-            self._decode_thread.close(timeout_s=1.0 if finished else 0.0)
+        if self._runtimes is not None:
+            self._runtimes.close(timeout_s=1.0 if finished else 0.0)
         self.lifecycle.enter(Phase.STOPPED)
         return finished
 
@@ -235,18 +252,6 @@ class Server:
         finished = self._service.idle.is_set()
         if not finished:
             _log.warning("calls in flight were cut off after %.1f s of grace", grace_s)
-        if self._service.runtime is not None:
-            await self._service.runtime.batcher.close()
+        for runtime in self._service.models:
+            await runtime.batcher.close()
         return finished
-
-    def _check_message_cap(self, engine: Engine) -> None:
-        info = engine.info
-        payload_bytes = codec.encoded_bytes(
-            info.num_tokens, info.token_dim, "float32", num_towers=len(info.tower_dims)
-        )
-        needed = payload_bytes + _ENVELOPE_BYTES
-        if needed > self.settings.max_request_bytes:
-            raise SettingsError(
-                f"max_request_bytes is {self.settings.max_request_bytes}, an unpruned float32 "
-                f"observation of {info.name} needs {needed}: raise --max-request-bytes"
-            )

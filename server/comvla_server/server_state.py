@@ -8,7 +8,8 @@ from typing import Any
 
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.metrics import Metrics
-from comvla_server.service import PolicyService, Runtime
+from comvla_server.models import Runtime
+from comvla_server.service import PolicyService
 from comvla_server.version import server_version
 
 

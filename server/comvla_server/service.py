@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
@@ -17,20 +18,19 @@ from comvla.images import MAX_VIEW_PIXELS, coding_name, picture_bytes
 from comvla.load_hints import LoadHints
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.accounts import Answered, CallAccounts
-from comvla_server.batcher import Batcher
 from comvla_server.calls import CallRecord, this_call
-from comvla_server.decoding import Decoding
-from comvla_server.engine import Engine
 from comvla_server.fleet import Fleet
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.loop_watch import LoopWatch
 from comvla_server.memory import BytesInFlight, Lease
 from comvla_server.metrics import Metrics
+from comvla_server.models import Models, Runtime
 from comvla_server.piecewise import PieceReader
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.settings import ServerSettings
 from comvla_server.tickets import Answer
-from comvla_server.validation import Validator, content_digest
+from comvla_server.tracing import Tracing, current_trace
+from comvla_server.validation import content_digest
 from comvla_server.version import server_version
 from comvla_vla.request import AnyRequest
 
@@ -38,6 +38,7 @@ STATUS = {
     Reason.MALFORMED: grpc.StatusCode.INVALID_ARGUMENT,
     Reason.INVALID: grpc.StatusCode.INVALID_ARGUMENT,
     Reason.CONFLICT: grpc.StatusCode.INVALID_ARGUMENT,
+    Reason.UNKNOWN_MODEL: grpc.StatusCode.NOT_FOUND,
     Reason.MISMATCH: grpc.StatusCode.FAILED_PRECONDITION,
     Reason.OVERSIZE: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Reason.OVERLOAD: grpc.StatusCode.RESOURCE_EXHAUSTED,
@@ -64,16 +65,6 @@ def hints(refusal: Refusal) -> tuple[tuple[str, str], ...]:
     return LoadHints(refusal.retry_after_s, refusal.suggested_tokens).to_metadata()
 
 
-@dataclass(frozen=True)
-class Runtime:
-    """What exists once the model is loaded."""
-
-    engine: Engine
-    batcher: Batcher
-    validator: Validator
-    decoding: Decoding
-
-
 class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
     """Validates, queues, answers. One instance lives on one event loop.
 
@@ -83,9 +74,10 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         settings: limits and the default deadline.
         fleet: where people see calls.
         clock: monotonic seconds.
+        tracing: makes traces; None makes none.
 
     Attributes:
-        runtime: the loaded model behind its queue, None while loading.
+        models: what answers, by name; empty while loading.
         loop_watch: whether the event loop keeps up; runs where its ``run`` does.
         fleet: what robots did lately.
     """
@@ -97,8 +89,10 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         settings: ServerSettings,
         fleet: Fleet | None = None,
         clock: Callable[[], float] = time.monotonic,
+        tracing: Tracing | None = None,
     ) -> None:
-        self.runtime: Runtime | None = None
+        self._tracing = tracing
+        self.models = Models()
         self._lifecycle = lifecycle
         self._metrics = metrics
         self._settings = settings
@@ -110,6 +104,11 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         metrics.watch_bytes(lambda: self._in_flight.held)
 
     @property
+    def runtime(self) -> Runtime | None:
+        """The default model behind its queue, None while loading."""
+        return self.models.default
+
+    @property
     def idle(self) -> asyncio.Event:
         """Set while no call for actions is open."""
         return self._accounts.idle
@@ -119,7 +118,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
     ) -> policy_pb2.GetModelResponse:
         """Describes the model, to any protocol version: the robot says what differs."""
         try:
-            runtime = self._require_runtime()
+            runtime = self._find(request.model)
         except Refusal as refusal:
             await context.abort(STATUS[refusal.reason], refusal.message)
         return handshake.to_response(
@@ -130,6 +129,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             progressive=True,
             image_codings=runtime.engine.image_codings,
             run_options=runtime.engine.run_options,
+            edge_fingerprints=sorted(runtime.validator.also),
         )
 
     def glance(self, time_remaining_s: float | None) -> Refusal | None:
@@ -159,7 +159,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
     ) -> policy_pb2.InferResponse:
         """Actions for one observation, or a status that says why not."""
         try:
-            return await self.infer(request, context.time_remaining())
+            with self._traced("Infer", context):
+                return await self.infer(request, context.time_remaining())
         except Refusal as refusal:
             await context.abort(STATUS[refusal.reason], refusal.message, hints(refusal))
 
@@ -168,7 +169,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
     ) -> policy_pb2.InferProgressiveResponse:
         """Actions for as much of one observation as came in time, or a status that says why not."""
         try:
-            response = await self.infer_progressive(messages, context.time_remaining())
+            with self._traced("InferProgressive", context):
+                response = await self.infer_progressive(messages, context.time_remaining())
         except Refusal as refusal:
             await context.abort(STATUS[refusal.reason], refusal.message, hints(refusal))
         return policy_pb2.InferProgressiveResponse(response=response)
@@ -191,7 +193,9 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             self._count_content(request)
             with self._in_flight.lease() as lease:
                 lease.take(request.ByteSize())
-                return await self._answer(request, lease, started_s, deadline_s)
+                runtime = self._find(request.model)
+                with self._using(runtime):
+                    return await self._answer(runtime, request, lease, started_s, deadline_s)
 
         return await self._watched(self._accounts.run(request, time_remaining_s, work))
 
@@ -234,6 +238,13 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         finally:
             self.loop_watch.note(died=died)
 
+    def _traced(
+        self, method: str, context: grpc.aio.ServicerContext[Any, Any]
+    ) -> AbstractContextManager[None]:
+        if self._tracing is None:
+            return contextlib.nullcontext()
+        return self._tracing.call(method, context.invocation_metadata())
+
     def note_malformed(self, size_bytes: int) -> Refusal:
         """Counts bytes that are no InferRequest, and says so."""
         refusal = Refusal(
@@ -248,10 +259,20 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         self.fleet.note(nobodys, call, refusal.reason.value, None)
         return refusal
 
-    def _require_runtime(self) -> Runtime:
+    def _find(self, model: str) -> Runtime:
+        """The model that a call asks for. While it is at work it is one of its users."""
         self._lifecycle.require_ready()
-        assert self.runtime is not None, "a server that is ready has a model"
-        return self.runtime
+        return self.models.find(model)
+
+    @contextlib.contextmanager
+    def _using(self, runtime: Runtime) -> Iterator[None]:
+        """Around the work of a model for one call."""
+        with runtime.users.one():
+            try:
+                yield
+            except BaseException:
+                self._metrics.model_requests.labels(runtime.label, "refused").inc()
+                raise
 
     async def _answer_stream(
         self,
@@ -261,41 +282,45 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         started_s: float,
         deadline_s: float,
     ) -> Answered:
-        runtime = self._require_runtime()
+        self._lifecycle.require_ready()
 
         def note(message: policy_pb2.InferProgressiveRequest) -> None:
             size = message.ByteSize()
             self._count_message(size)
             lease.take(size)
 
-        reader = PieceReader(messages, runtime.engine.info, note, self._clock)
-        try:
-            patience_s = min(deadline_s - started_s, self._settings.default_deadline_s)
-            head = await reader.head(patience_s)
-            request.CopyFrom(head.request)
-            runtime.validator.check_head(request)
-            digest = content_digest(request)
-            if runtime.batcher.find(request.session_id, request.step, digest) is not None:
-                reader.ending = "repeat"
-            else:
-                headed_s = self._clock()
-                window_s = min(head.window_s, deadline_s - headed_s)
-                request.payload = await reader.collect(window_s, head.min_tokens)
-                self._metrics.step_phase.labels("collect").observe(self._clock() - headed_s)
-        finally:
-            self._count_payload(reader.payload)
-            self._metrics.streams.labels(reader.ending).inc()
-        return await self._answer(request, lease, started_s, deadline_s, digest)
+        reader = PieceReader(messages, note, self._clock)
+        with contextlib.ExitStack() as held:
+            try:
+                patience_s = min(deadline_s - started_s, self._settings.default_deadline_s)
+                head = await reader.head(patience_s)
+                request.CopyFrom(head.request)
+                runtime = self._find(request.model)
+                held.enter_context(self._using(runtime))
+                reader.expect(runtime.engine.info, head.min_tokens)
+                runtime.validator.check_head(request)
+                digest = content_digest(request)
+                if runtime.batcher.find(request.session_id, request.step, digest) is not None:
+                    reader.ending = "repeat"
+                else:
+                    headed_s = self._clock()
+                    window_s = min(head.window_s, deadline_s - headed_s)
+                    request.payload = await reader.collect(window_s)
+                    self._metrics.step_phase.labels("collect").observe(self._clock() - headed_s)
+            finally:
+                self._count_payload(reader.payload)
+                self._metrics.streams.labels(reader.ending).inc()
+            return await self._answer(runtime, request, lease, started_s, deadline_s, digest)
 
     async def _answer(
         self,
+        runtime: Runtime,
         request: policy_pb2.InferRequest,
         lease: Lease,
         started_s: float,
         deadline_s: float,
         digest: bytes | None = None,
     ) -> Answered:
-        runtime = self._require_runtime()
         if deadline_s <= started_s:
             raise Refusal(
                 Reason.DEADLINE,
@@ -312,10 +337,9 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         if digest is None:
             digest = content_digest(request)
         ticket = batcher.find(request.session_id, request.step, digest)
-        decode_s = 0.0
+        decode_began_s, decode_s = self._clock(), 0.0
         policy_request: AnyRequest | None = None
         if ticket is None:
-            decode_began_s = self._clock()
             lease.take(_decoded_bytes(request))
             policy_request = await self._read(runtime, request, deadline_s)
             this_call().note_read(policy_request, runtime.engine.info)
@@ -333,12 +357,25 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 request.session_id, request.step, policy_request, digest, deadline_s
             )
         answer = await batcher.wait(ticket, deadline_s)
+        finished_s = self._clock()
+        self._metrics.model_requests.labels(runtime.label, "repeat" if repeat else "ok").inc()
         response = self._response(request, runtime, answer)
         response.timings.decode_s = decode_s
         if not on_record:  # phases of this call, so that they never exceed its total
             response.timings.queue_s = answer.queue_s
             response.timings.predict_s = answer.predict_s
         response.timings.total_s = self._clock() - started_s
+        if (trace := current_trace()) is not None:
+            trace.answered(
+                request,
+                answer,
+                model=runtime.label,
+                decoded_s=(decode_began_s, decode_began_s + decode_s),
+                admitted_s=ticket.admitted_s,
+                finished_s=finished_s,
+                encoded_s=self._clock(),
+                repeat=repeat,
+            )
         return response, repeat
 
     async def _read(
@@ -368,7 +405,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 utilization=runtime.batcher.utilization,
                 suggested_tokens=runtime.batcher.suggested_tokens,
             ),
-            model_fingerprint=runtime.engine.info.fingerprint,
+            # Checked: the model's own, or that of one with the same edge half.
+            model_fingerprint=request.model_fingerprint,
         )
 
     def _count_message(self, size_bytes: int) -> None:

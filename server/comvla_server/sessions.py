@@ -156,6 +156,18 @@ class SessionTable:
         self._evict(session, now_s)
         return session
 
+    def adopt(self, before: SessionTable) -> None:
+        """Takes over whose sessions are whose, and how far each is, but no answers: they are another
+        model's. A repeat of the newest step is then computed again."""
+        for old in before:
+            self._sessions[old.session_id] = Session(
+                old.session_id,
+                old.last_seen_s,
+                old.owner,
+                first_step=old.newest_step + 1,
+                newest_step=old.newest_step,
+            )
+
     def _evict(self, keep: Session, now_s: float) -> None:
         excess = len(self) - self._max_sessions
         leaving: list[str] = []

@@ -42,6 +42,7 @@ class Declaration:
         path: whether it names a file.
         serve_default: default of the command line where it differs from the one in code.
         parse: text to value, where the type alone does not say how.
+        join: makes one text of an option that may be given several times.
     """
 
     words: str
@@ -56,6 +57,7 @@ class Declaration:
     path: bool = False
     serve_default: Any = None
     parse: Callable[[str], Any] | None = None
+    join: Callable[[list[str]], str] | None = None
 
 
 @dataclass(frozen=True)

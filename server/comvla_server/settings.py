@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from comvla_server.contradictions import check_together
+from comvla_server.model_names import join_models, parse_models
 from comvla_server.setting_fields import SettingsError, check_value, fields_of, setting
 
 __all__ = ["ServerSettings", "SettingsError"]
@@ -13,7 +14,7 @@ __all__ = ["ServerSettings", "SettingsError"]
 MODEL, NETWORK, TLS = "model", "network", "encryption"
 ACCESS, LIMITS, CONNECTIONS = "who may call", "limits", "connections"
 OVERLOAD = "when more is asked than can be answered"
-LOGS = "logs, on stderr"
+LOGS, TRACES = "logs, on stderr", "traces (OpenTelemetry)"
 
 
 def _fastv(text: str) -> tuple[int, float]:
@@ -35,9 +36,11 @@ class ServerSettings:
 
     model: str = setting(
         "mini",
-        "checkpoint folder, hf://owner/name on the hub, or mini, the shipped policy",
+        "checkpoint folder, hf://owner/name on the hub, or mini, the shipped policy. For several give "
+        "NAME=SOURCE for each: robots choose by name, and the first is the default",
         MODEL,
         metavar="SOURCE",
+        join=join_models,
     )
     device: str = setting("cpu", "torch device, e.g. cuda:0", MODEL)
     dtype: str = setting(
@@ -266,6 +269,19 @@ class ServerSettings:
         choices=("debug", "info", "warning", "error"),
     )
 
+    otel_endpoint: str | None = setting(
+        None,
+        "where traces go over OTLP/HTTP, e.g. http://127.0.0.1:4318/v1/traces; none where not given",
+        TRACES,
+        metavar="URL",
+    )
+    otel_sample: float = setting(
+        1.0,
+        "share of the calls traced that are not part of a robot's trace, 0 to 1",
+        TRACES,
+        unit="share",
+    )
+
     def __post_init__(self) -> None:
         """Refuses what cannot work."""
         fields = fields_of(type(self))
@@ -276,6 +292,11 @@ class ServerSettings:
                 object.__setattr__(self, name, value)
             check_value(field, value)
         check_together(self)
+
+    @property
+    def models(self) -> dict[str, str]:
+        """Checkpoints by the names under which robots ask for them, the default first."""
+        return parse_models(self.model)
 
     @property
     def tls(self) -> bool:

@@ -39,12 +39,18 @@ def settings_of(
     Raises:
         SettingsError: a value or a name that is no good, or a contradiction.
     """
-    given = {name: value for name, value in vars(arguments).items() if name in _names()}
+    fields = fields_of(ServerSettings)
+    given = {
+        name: _joined(fields[name], value)
+        for name, value in vars(arguments).items()
+        if name in fields
+    }
     return resolve(given, os.environ if environment is None else environment, arguments.config)
 
 
-def _names() -> set[str]:
-    return set(fields_of(ServerSettings))
+def _joined(field: SettingField, value: Any) -> Any:
+    join = field.declared.join
+    return join(value) if join is not None and isinstance(value, list) else value
 
 
 def _add_flag(group: Any, field: SettingField) -> None:
@@ -63,6 +69,7 @@ def _add_flag(group: Any, field: SettingField) -> None:
         field.flag,
         # Text, so that flags, variables and files are read and refused by the same code.
         type=str,
+        action="store" if declared.join is None else "append",
         choices=declared.choices or None,
         default=argparse.SUPPRESS,
         metavar=None if declared.choices else _metavar(field),

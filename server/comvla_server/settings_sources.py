@@ -169,6 +169,8 @@ def _read(field: SettingField, value: str | bool, where: str) -> Any:
 
 def _strict(field: SettingField, value: object, where: str) -> Any:
     """A value that came with a type of its own: 1 is not true, and 8.0 not 8."""
+    if field.declared.join is not None and isinstance(value, list):
+        return _read(field, field.declared.join(list(map(str, value))), where)
     if field.declared.parse is not None and isinstance(value, list):
         return _read(field, ",".join(map(str, value)), where)
     try:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from comvla.number_arguments import number, whole
-from comvla_server.identity import IDENTITY_PATTERN, Identity, Limits
+from comvla_server.identity import IDENTITY_PATTERN, MAY_SWAP, Identity, Limits
 from comvla_server.tokens import TokenLine, TokensError, new_token, read_lines
 
 _DESCRIPTION = """\
@@ -47,6 +47,11 @@ def add_parser(subparsers: Any) -> None:
     ):
         counts = name == "--max-request-bytes"
         new.add_argument(name, type=whole() if counts else number(), metavar="N", help=words)
+    new.add_argument(
+        "--may-swap",
+        action="store_true",
+        help="an operator who may replace models (comvla-server swap)",
+    )
     listing = actions.add_parser("list", help="print identities and the beginnings of hashes")
     revoke = actions.add_parser("revoke", help="take tokens away")
     revoke.add_argument("identity", help="name of the robot or operator")
@@ -72,9 +77,10 @@ def _new(args: argparse.Namespace) -> int:
         if value is not None and not 0 < value < float("inf"):
             raise TokensError(f"expected {name} as a finite number above 0, got {value}")
     limits = Limits(args.requests_per_s, args.bytes_per_s, args.max_request_bytes)
+    identity = Identity(args.identity, limits, frozenset([MAY_SWAP] if args.may_swap else []))
     token = new_token()
     with _alone(args.file):
-        _append(args.file, TokenLine.of(Identity(args.identity, limits), token))
+        _append(args.file, TokenLine.of(identity, token))
     print(token)
     print(
         f"comvla-server: {args.identity} was added to {args.file}; this token is shown only now",
@@ -88,10 +94,10 @@ def _append(path: Path, added: TokenLine) -> None:
     known = read_lines(path, "--file") if text.strip() else []
     identity = added.identity
     for line in known:
-        if line.identity.name == identity.name and line.identity.limits != identity.limits:
+        if line.identity.name == identity.name and line.identity != identity:
             raise TokensError(
-                f"{identity.name} is in {path} with other limits: give the same, or revoke its "
-                "tokens first"
+                f"{identity.name} is in {path} with other limits or rights: give the same, or revoke "
+                "its tokens first"
             )
     if text and not text.endswith("\n"):
         text += "\n"

@@ -1,8 +1,8 @@
 """Bearer tokens: a file of their hashes, and whose they are.
 
 A line of the file is ``IDENTITY sha256:HEX`` and perhaps limits: ``requests_per_s=20
-bytes_per_s=2e6 max_request_bytes=300000``. Tokens are 256 random bits, so a plain hash of one tells
-nothing, and a stolen file opens nothing.
+bytes_per_s=2e6 max_request_bytes=300000``, or for operators the right ``may_swap``. Tokens are 256
+random bits, so a plain hash of one tells nothing, and a stolen file opens nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from comvla_server.identity import IDENTITY_PATTERN, Identity, Limits
+from comvla_server.identity import IDENTITY_PATTERN, RIGHTS, Identity, Limits
 from comvla_server.secret_files import read_text
 from comvla_server.setting_fields import SettingsError
 
@@ -62,7 +62,8 @@ class TokenLine:
     def __str__(self) -> str:
         given = [(name, getattr(self.identity.limits, name)) for name in _LIMITS]
         limits = "".join(f" {name}={value!r}" for name, value in given if value is not None)
-        return f"{self.identity.name} sha256:{self.digest.hex()}{limits}"
+        rights = "".join(f" {right}" for right in sorted(self.identity.rights))
+        return f"{self.identity.name} sha256:{self.digest.hex()}{limits}{rights}"
 
 
 class TokenTable:
@@ -142,17 +143,17 @@ def read_lines(path: Path, option: str) -> list[TokenLine]:
             holds the line, which might be a secret.
     """
     lines: list[TokenLine] = []
-    limits: dict[str, Limits] = {}
+    known: dict[str, Identity] = {}
     for number, text in enumerate(read_text(path, option, TokensError).splitlines(), 1):
         words = text.partition("#")[0].split()
         if not words:
             continue
         line = _parse(words, f"{path}, line {number}")
         name = line.identity.name
-        if limits.setdefault(name, line.identity.limits) != line.identity.limits:
+        if known.setdefault(name, line.identity) != line.identity:
             raise TokensError(
-                f"{path}, line {number}: {name} has other limits than on a line before; all tokens "
-                "of one identity share its limits"
+                f"{path}, line {number}: {name} has other limits or rights than on a line before; "
+                "all tokens of one identity share them"
             )
         lines.append(line)
     if not lines:
@@ -170,7 +171,10 @@ def _parse(words: list[str], where: str) -> TokenLine:
             "`comvla-server token new` writes such lines"
         )
     given: dict[str, float] = {}
+    rights = frozenset(words[2:]) & frozenset(RIGHTS)
     for word in words[2:]:
+        if word in rights:
+            continue
         limit, _, value = word.partition("=")
         if limit not in _LIMITS or limit in given:
             raise TokensError(f"{where}: expected limits {', '.join(_LIMITS)}, each at most once")
@@ -183,4 +187,4 @@ def _parse(words: list[str], where: str) -> TokenLine:
         given[limit] = number
     largest = given.pop("max_request_bytes", None)
     limits = Limits(**given, max_request_bytes=None if largest is None else int(largest))
-    return TokenLine(Identity(name, limits), bytes.fromhex(digest[1]))
+    return TokenLine(Identity(name, limits, rights), bytes.fromhex(digest[1]))

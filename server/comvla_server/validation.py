@@ -37,10 +37,12 @@ class Validator:
     Attributes:
         engine: the model that will run.
         max_request_bytes: largest message, bytes.
+        also: fingerprints of other models with the same edge half, whose robots are answered too.
     """
 
     engine: Engine
     max_request_bytes: int
+    also: frozenset[str] = frozenset()
 
     def check_identity(self, request: policy_pb2.InferRequest) -> None:
         """Size, protocol, model, session and lengths: what can be told without reading the content.
@@ -62,7 +64,7 @@ class Validator:
                 f"{request.protocol_version}: install the same comvla release on robot and server",
             )
         info = self.engine.info
-        if request.model_fingerprint != info.fingerprint:
+        if request.model_fingerprint not in (info.fingerprint, *self.also):
             raise Refusal(
                 Reason.MISMATCH,
                 f"server runs {info.name} with fingerprint {shown(info.fingerprint)}, the request "

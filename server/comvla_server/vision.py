@@ -83,6 +83,10 @@ class VisionHalf:
         """Multiply-adds counted twice of the towers over all views."""
         return float(self._edge.vision_flops())
 
+    def keep_decoders(self, before: Vision) -> None:
+        """Goes on with the decoders of the vision half that this one replaces."""
+        self.decoders = before.decoders
+
 
 def load_vision(
     source: str,

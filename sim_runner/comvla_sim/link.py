@@ -336,6 +336,7 @@ class EnforcedLink:
             snr=request.HasField("snr_db"),
             snr_age=request.HasField("snr_age_s"),
             protocol_version=request.protocol_version,
+            model=request.model,
         )
         return codec.wire_bytes(message) + codec.CALL_HEADERS_BYTES
 

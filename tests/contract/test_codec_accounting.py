@@ -81,6 +81,7 @@ texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=200)
     snr_db=st.none() | st.floats(width=32),
     snr_age_s=st.none() | st.just(0.0),
     protocol_version=st.integers(0, 2**32 - 1),
+    model=texts,
 )
 def test_infer_request_bytes_is_the_serialised_length(
     payload: int,
@@ -92,6 +93,7 @@ def test_infer_request_bytes_is_the_serialised_length(
     snr_db: float | None,
     snr_age_s: float | None,
     protocol_version: int,
+    model: str,
 ) -> None:
     request = policy_pb2.InferRequest(
         session_id=session_id,
@@ -103,6 +105,7 @@ def test_infer_request_bytes_is_the_serialised_length(
         snr_db=snr_db,
         snr_age_s=snr_age_s,
         protocol_version=protocol_version,
+        model=model,
     )
     assert len(request.SerializeToString()) == codec.infer_request_bytes(
         payload,
@@ -114,10 +117,11 @@ def test_infer_request_bytes_is_the_serialised_length(
         snr=snr_db is not None,
         snr_age=snr_age_s is not None,
         protocol_version=protocol_version,
+        model=model,
     )
 
 
-def test_infer_request_bytes_knows_every_field_with_a_one_byte_tag() -> None:
+def test_infer_request_bytes_knows_every_field_and_the_length_of_its_tag() -> None:
     """A new field must be added to the accounting, and a number above 15 takes a longer tag."""
     fields = policy_pb2.InferRequest.DESCRIPTOR.fields
     assert {field.name for field in fields} == {
@@ -131,8 +135,9 @@ def test_infer_request_bytes_knows_every_field_with_a_one_byte_tag() -> None:
         "snr_age_s",
         "protocol_version",
         "images",
+        "model",
     }
-    assert max(field.number for field in fields) < 16
+    assert {field.name for field in fields if field.number > 15} == {"model"}
 
 
 def test_request_wire_bytes_composes_payload_message_and_frames() -> None:

@@ -434,7 +434,7 @@ def test_a_real_vision_half_gives_the_robots_own_tokens(
 
 
 def test_a_whole_checkpoint_is_served_with_vision_and_a_half_without(tmp_path: Any) -> None:
-    from comvla_server.serve_command import load_engine
+    from comvla_server.model_loading import load_engine
     from comvla_vla import split_checkpoint
 
     def codings(model: str, vision: str = "auto") -> tuple[str, ...]:

@@ -62,7 +62,8 @@ round trip. Clients may be older.
 _FRAME_HEADER_BYTES = 9
 _GRPC_PREFIX_BYTES = 5
 _TCP_IP_HEADER_BYTES = 52
-_TAG_BYTES = 1  # every field number of InferRequest is below 16
+_TAG_BYTES = 1  # of the fields of InferRequest whose number is below 16
+_LONG_TAG_BYTES = 2  # of the others
 
 
 def wire_bytes(message_bytes: int, *, tcp_ip: bool = False, mtu_bytes: int = 1500) -> int:
@@ -146,6 +147,7 @@ def infer_request_bytes(
     snr_age: bool = True,
     protocol_version: int = 1,
     images_length: int = 0,
+    model: str = "",
 ) -> int:
     """Exact serialised length of an ``InferRequest``, without building it.
 
@@ -161,6 +163,7 @@ def infer_request_bytes(
         protocol_version: as in the request.
         images_length: bytes of its ``images`` message, see :func:`comvla.images.images_bytes`; 0
             where tokens are sent.
+        model: as in the request.
 
     Raises:
         CodecError: a negative number.
@@ -176,6 +179,8 @@ def infer_request_bytes(
     lengths += [4 * proprio_dim, payload_length, images_length]
     total = sum(_TAG_BYTES + varint_bytes(length) + length for length in lengths if length)
     total += sum(_TAG_BYTES + varint_bytes(number) for number in (step, protocol_version) if number)
+    if named := len(model.encode()):
+        total += _LONG_TAG_BYTES + varint_bytes(named) + named
     return total + (_TAG_BYTES + 4) * (snr + snr_age)
 
 

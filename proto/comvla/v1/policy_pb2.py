@@ -14,7 +14,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x16\x63omvla/v1/policy.proto\x12\tcomvla.v1\"9\n\nCodedImage\x12\x0c\n\x04\x64\x61ta\x18\x01 \x01(\x0c\x12\x0e\n\x06height\x18\x02 \x01(\r\x12\r\n\x05width\x18\x03 \x01(\r\"\x87\x01\n\x0b\x43odedImages\x12&\n\x06\x63oding\x18\x01 \x01(\x0e\x32\x16.comvla.v1.ImageCoding\x12$\n\x05views\x18\x02 \x03(\x0b\x32\x15.comvla.v1.CodedImage\x12\x19\n\x0c\x66ollows_step\x18\x03 \x01(\x04H\x00\x88\x01\x01\x42\x0f\n\r_follows_step\"+\n\x0fGetModelRequest\x12\x18\n\x10protocol_version\x18\x01 \x01(\r\"\x81\x04\n\x10GetModelResponse\x12\x18\n\x10protocol_version\x18\x01 \x01(\r\x12\x12\n\nmodel_name\x18\x02 \x01(\t\x12\x19\n\x11model_fingerprint\x18\x03 \x01(\t\x12\x12\n\nnum_tokens\x18\x04 \x01(\r\x12\x11\n\ttoken_dim\x18\x05 \x01(\r\x12\x12\n\ntower_dims\x18\x06 \x03(\r\x12\x0c\n\x04grid\x18\x07 \x03(\r\x12\x16\n\x0e\x61\x63tion_horizon\x18\x08 \x01(\r\x12\x12\n\naction_dim\x18\t \x01(\r\x12\x13\n\x0bproprio_dim\x18\n \x01(\r\x12\x19\n\x11max_prompt_tokens\x18\x0b \x01(\r\x12\x15\n\rdelta_actions\x18\x0c \x03(\x08\x12\x18\n\x10\x63ontrol_period_s\x18\r \x01(\x01\x12.\n\rquantizations\x18\x0e \x03(\x0e\x32\x17.comvla.v1.Quantization\x12\x19\n\x11max_request_bytes\x18\x0f \x01(\x04\x12\x16\n\x0eserver_version\x18\x10 \x01(\t\x12\x12\n\nimage_size\x18\x11 \x03(\r\x12-\n\rimage_codings\x18\x12 \x03(\x0e\x32\x16.comvla.v1.ImageCoding\x12\x13\n\x0bprogressive\x18\x13 \x01(\x08\x12\x13\n\x0brun_options\x18\x14 \x03(\t\"\x8a\x02\n\x0cInferRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x13\n\x0binstruction\x18\x03 \x01(\t\x12\x0f\n\x07proprio\x18\x04 \x03(\x02\x12\x0f\n\x07payload\x18\x05 \x01(\x0c\x12\x19\n\x11model_fingerprint\x18\x06 \x01(\t\x12\x13\n\x06snr_db\x18\x07 \x01(\x02H\x00\x88\x01\x01\x12\x16\n\tsnr_age_s\x18\x08 \x01(\x02H\x01\x88\x01\x01\x12\x18\n\x10protocol_version\x18\t \x01(\r\x12&\n\x06images\x18\n \x01(\x0b\x32\x16.comvla.v1.CodedImagesB\t\n\x07_snr_dbB\x0c\n\n_snr_age_s\"\x95\x02\n\rInferResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x0f\n\x07\x61\x63tions\x18\x03 \x03(\x02\x12\x16\n\x0e\x61\x63tion_horizon\x18\x04 \x01(\r\x12\x12\n\naction_dim\x18\x05 \x01(\r\x12\x13\n\x0btokens_used\x18\x06 \x01(\r\x12\x12\n\nbatch_size\x18\x07 \x01(\r\x12\x13\n\x0b\x63loud_flops\x18\x08 \x01(\x01\x12)\n\x07timings\x18\t \x01(\x0b\x32\x18.comvla.v1.ServerTimings\x12!\n\x04load\x18\n \x01(\x0b\x32\x13.comvla.v1.LoadHint\x12\x19\n\x11model_fingerprint\x18\x0b \x01(\t\"c\n\x17InferProgressiveRequest\x12/\n\x04head\x18\x01 \x01(\x0b\x32\x1f.comvla.v1.InferProgressiveHeadH\x00\x12\x0f\n\x05piece\x18\x02 \x01(\x0cH\x00\x42\x06\n\x04part\"f\n\x14InferProgressiveHead\x12(\n\x07request\x18\x01 \x01(\x0b\x32\x17.comvla.v1.InferRequest\x12\x10\n\x08window_s\x18\x02 \x01(\x02\x12\x12\n\nmin_tokens\x18\x03 \x01(\r\"F\n\x18InferProgressiveResponse\x12*\n\x08response\x18\x01 \x01(\x0b\x32\x18.comvla.v1.InferResponse\"V\n\rServerTimings\x12\x10\n\x08\x64\x65\x63ode_s\x18\x01 \x01(\x01\x12\x0f\n\x07queue_s\x18\x02 \x01(\x01\x12\x11\n\tpredict_s\x18\x03 \x01(\x01\x12\x0f\n\x07total_s\x18\x04 \x01(\x01\"N\n\x08LoadHint\x12\x13\n\x0bqueue_depth\x18\x01 \x01(\r\x12\x13\n\x0butilization\x18\x02 \x01(\x02\x12\x18\n\x10suggested_tokens\x18\x03 \x01(\r*\x8e\x01\n\x0cQuantization\x12\x1c\n\x18QUANTIZATION_UNSPECIFIED\x10\x00\x12\x18\n\x14QUANTIZATION_FLOAT32\x10\x01\x12\x18\n\x14QUANTIZATION_FLOAT16\x10\x02\x12\x15\n\x11QUANTIZATION_INT8\x10\x03\x12\x15\n\x11QUANTIZATION_INT4\x10\x04*\xba\x01\n\x0bImageCoding\x12\x1c\n\x18IMAGE_CODING_UNSPECIFIED\x10\x00\x12\x15\n\x11IMAGE_CODING_JPEG\x10\x01\x12\x15\n\x11IMAGE_CODING_WEBP\x10\x02\x12\x15\n\x11IMAGE_CODING_AVIF\x10\x03\x12\x15\n\x11IMAGE_CODING_H264\x10\x04\x12\x1a\n\x16IMAGE_CODING_DEEP_JSCC\x10\x05\x12\x15\n\x11IMAGE_CODING_WITT\x10\x06\x32\xfe\x01\n\rPolicyService\x12H\n\x08GetModel\x12\x1a.comvla.v1.GetModelRequest\x1a\x1b.comvla.v1.GetModelResponse\"\x03\x90\x02\x01\x12?\n\x05Infer\x12\x17.comvla.v1.InferRequest\x1a\x18.comvla.v1.InferResponse\"\x03\x90\x02\x02\x12\x62\n\x10InferProgressive\x12\".comvla.v1.InferProgressiveRequest\x1a#.comvla.v1.InferProgressiveResponse\"\x03\x90\x02\x02(\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x16\x63omvla/v1/policy.proto\x12\tcomvla.v1\"9\n\nCodedImage\x12\x0c\n\x04\x64\x61ta\x18\x01 \x01(\x0c\x12\x0e\n\x06height\x18\x02 \x01(\r\x12\r\n\x05width\x18\x03 \x01(\r\"\x87\x01\n\x0b\x43odedImages\x12&\n\x06\x63oding\x18\x01 \x01(\x0e\x32\x16.comvla.v1.ImageCoding\x12$\n\x05views\x18\x02 \x03(\x0b\x32\x15.comvla.v1.CodedImage\x12\x19\n\x0c\x66ollows_step\x18\x03 \x01(\x04H\x00\x88\x01\x01\x42\x0f\n\r_follows_step\":\n\x0fGetModelRequest\x12\x18\n\x10protocol_version\x18\x01 \x01(\r\x12\r\n\x05model\x18\x02 \x01(\t\"\x9c\x04\n\x10GetModelResponse\x12\x18\n\x10protocol_version\x18\x01 \x01(\r\x12\x12\n\nmodel_name\x18\x02 \x01(\t\x12\x19\n\x11model_fingerprint\x18\x03 \x01(\t\x12\x12\n\nnum_tokens\x18\x04 \x01(\r\x12\x11\n\ttoken_dim\x18\x05 \x01(\r\x12\x12\n\ntower_dims\x18\x06 \x03(\r\x12\x0c\n\x04grid\x18\x07 \x03(\r\x12\x16\n\x0e\x61\x63tion_horizon\x18\x08 \x01(\r\x12\x12\n\naction_dim\x18\t \x01(\r\x12\x13\n\x0bproprio_dim\x18\n \x01(\r\x12\x19\n\x11max_prompt_tokens\x18\x0b \x01(\r\x12\x15\n\rdelta_actions\x18\x0c \x03(\x08\x12\x18\n\x10\x63ontrol_period_s\x18\r \x01(\x01\x12.\n\rquantizations\x18\x0e \x03(\x0e\x32\x17.comvla.v1.Quantization\x12\x19\n\x11max_request_bytes\x18\x0f \x01(\x04\x12\x16\n\x0eserver_version\x18\x10 \x01(\t\x12\x12\n\nimage_size\x18\x11 \x03(\r\x12-\n\rimage_codings\x18\x12 \x03(\x0e\x32\x16.comvla.v1.ImageCoding\x12\x13\n\x0bprogressive\x18\x13 \x01(\x08\x12\x13\n\x0brun_options\x18\x14 \x03(\t\x12\x19\n\x11\x65\x64ge_fingerprints\x18\x1f \x03(\t\"\x99\x02\n\x0cInferRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x13\n\x0binstruction\x18\x03 \x01(\t\x12\x0f\n\x07proprio\x18\x04 \x03(\x02\x12\x0f\n\x07payload\x18\x05 \x01(\x0c\x12\x19\n\x11model_fingerprint\x18\x06 \x01(\t\x12\x13\n\x06snr_db\x18\x07 \x01(\x02H\x00\x88\x01\x01\x12\x16\n\tsnr_age_s\x18\x08 \x01(\x02H\x01\x88\x01\x01\x12\x18\n\x10protocol_version\x18\t \x01(\r\x12&\n\x06images\x18\n \x01(\x0b\x32\x16.comvla.v1.CodedImages\x12\r\n\x05model\x18\x15 \x01(\tB\t\n\x07_snr_dbB\x0c\n\n_snr_age_s\"\x95\x02\n\rInferResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x0f\n\x07\x61\x63tions\x18\x03 \x03(\x02\x12\x16\n\x0e\x61\x63tion_horizon\x18\x04 \x01(\r\x12\x12\n\naction_dim\x18\x05 \x01(\r\x12\x13\n\x0btokens_used\x18\x06 \x01(\r\x12\x12\n\nbatch_size\x18\x07 \x01(\r\x12\x13\n\x0b\x63loud_flops\x18\x08 \x01(\x01\x12)\n\x07timings\x18\t \x01(\x0b\x32\x18.comvla.v1.ServerTimings\x12!\n\x04load\x18\n \x01(\x0b\x32\x13.comvla.v1.LoadHint\x12\x19\n\x11model_fingerprint\x18\x0b \x01(\t\"c\n\x17InferProgressiveRequest\x12/\n\x04head\x18\x01 \x01(\x0b\x32\x1f.comvla.v1.InferProgressiveHeadH\x00\x12\x0f\n\x05piece\x18\x02 \x01(\x0cH\x00\x42\x06\n\x04part\"f\n\x14InferProgressiveHead\x12(\n\x07request\x18\x01 \x01(\x0b\x32\x17.comvla.v1.InferRequest\x12\x10\n\x08window_s\x18\x02 \x01(\x02\x12\x12\n\nmin_tokens\x18\x03 \x01(\r\"F\n\x18InferProgressiveResponse\x12*\n\x08response\x18\x01 \x01(\x0b\x32\x18.comvla.v1.InferResponse\"V\n\rServerTimings\x12\x10\n\x08\x64\x65\x63ode_s\x18\x01 \x01(\x01\x12\x0f\n\x07queue_s\x18\x02 \x01(\x01\x12\x11\n\tpredict_s\x18\x03 \x01(\x01\x12\x0f\n\x07total_s\x18\x04 \x01(\x01\"N\n\x08LoadHint\x12\x13\n\x0bqueue_depth\x18\x01 \x01(\r\x12\x13\n\x0butilization\x18\x02 \x01(\x02\x12\x18\n\x10suggested_tokens\x18\x03 \x01(\r*\x8e\x01\n\x0cQuantization\x12\x1c\n\x18QUANTIZATION_UNSPECIFIED\x10\x00\x12\x18\n\x14QUANTIZATION_FLOAT32\x10\x01\x12\x18\n\x14QUANTIZATION_FLOAT16\x10\x02\x12\x15\n\x11QUANTIZATION_INT8\x10\x03\x12\x15\n\x11QUANTIZATION_INT4\x10\x04*\xba\x01\n\x0bImageCoding\x12\x1c\n\x18IMAGE_CODING_UNSPECIFIED\x10\x00\x12\x15\n\x11IMAGE_CODING_JPEG\x10\x01\x12\x15\n\x11IMAGE_CODING_WEBP\x10\x02\x12\x15\n\x11IMAGE_CODING_AVIF\x10\x03\x12\x15\n\x11IMAGE_CODING_H264\x10\x04\x12\x1a\n\x16IMAGE_CODING_DEEP_JSCC\x10\x05\x12\x15\n\x11IMAGE_CODING_WITT\x10\x06\x32\xfe\x01\n\rPolicyService\x12H\n\x08GetModel\x12\x1a.comvla.v1.GetModelRequest\x1a\x1b.comvla.v1.GetModelResponse\"\x03\x90\x02\x01\x12?\n\x05Infer\x12\x17.comvla.v1.InferRequest\x1a\x18.comvla.v1.InferResponse\"\x03\x90\x02\x02\x12\x62\n\x10InferProgressive\x12\".comvla.v1.InferProgressiveRequest\x1a#.comvla.v1.InferProgressiveResponse\"\x03\x90\x02\x02(\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -27,32 +27,32 @@ if _descriptor._USE_C_DESCRIPTORS == False:
   _globals['_POLICYSERVICE'].methods_by_name['Infer']._serialized_options = b'\220\002\002'
   _globals['_POLICYSERVICE'].methods_by_name['InferProgressive']._options = None
   _globals['_POLICYSERVICE'].methods_by_name['InferProgressive']._serialized_options = b'\220\002\002'
-  _globals['_QUANTIZATION']._serialized_start=1790
-  _globals['_QUANTIZATION']._serialized_end=1932
-  _globals['_IMAGECODING']._serialized_start=1935
-  _globals['_IMAGECODING']._serialized_end=2121
+  _globals['_QUANTIZATION']._serialized_start=1847
+  _globals['_QUANTIZATION']._serialized_end=1989
+  _globals['_IMAGECODING']._serialized_start=1992
+  _globals['_IMAGECODING']._serialized_end=2178
   _globals['_CODEDIMAGE']._serialized_start=37
   _globals['_CODEDIMAGE']._serialized_end=94
   _globals['_CODEDIMAGES']._serialized_start=97
   _globals['_CODEDIMAGES']._serialized_end=232
   _globals['_GETMODELREQUEST']._serialized_start=234
-  _globals['_GETMODELREQUEST']._serialized_end=277
-  _globals['_GETMODELRESPONSE']._serialized_start=280
-  _globals['_GETMODELRESPONSE']._serialized_end=793
-  _globals['_INFERREQUEST']._serialized_start=796
-  _globals['_INFERREQUEST']._serialized_end=1062
-  _globals['_INFERRESPONSE']._serialized_start=1065
-  _globals['_INFERRESPONSE']._serialized_end=1342
-  _globals['_INFERPROGRESSIVEREQUEST']._serialized_start=1344
-  _globals['_INFERPROGRESSIVEREQUEST']._serialized_end=1443
-  _globals['_INFERPROGRESSIVEHEAD']._serialized_start=1445
-  _globals['_INFERPROGRESSIVEHEAD']._serialized_end=1547
-  _globals['_INFERPROGRESSIVERESPONSE']._serialized_start=1549
-  _globals['_INFERPROGRESSIVERESPONSE']._serialized_end=1619
-  _globals['_SERVERTIMINGS']._serialized_start=1621
-  _globals['_SERVERTIMINGS']._serialized_end=1707
-  _globals['_LOADHINT']._serialized_start=1709
-  _globals['_LOADHINT']._serialized_end=1787
-  _globals['_POLICYSERVICE']._serialized_start=2124
-  _globals['_POLICYSERVICE']._serialized_end=2378
+  _globals['_GETMODELREQUEST']._serialized_end=292
+  _globals['_GETMODELRESPONSE']._serialized_start=295
+  _globals['_GETMODELRESPONSE']._serialized_end=835
+  _globals['_INFERREQUEST']._serialized_start=838
+  _globals['_INFERREQUEST']._serialized_end=1119
+  _globals['_INFERRESPONSE']._serialized_start=1122
+  _globals['_INFERRESPONSE']._serialized_end=1399
+  _globals['_INFERPROGRESSIVEREQUEST']._serialized_start=1401
+  _globals['_INFERPROGRESSIVEREQUEST']._serialized_end=1500
+  _globals['_INFERPROGRESSIVEHEAD']._serialized_start=1502
+  _globals['_INFERPROGRESSIVEHEAD']._serialized_end=1604
+  _globals['_INFERPROGRESSIVERESPONSE']._serialized_start=1606
+  _globals['_INFERPROGRESSIVERESPONSE']._serialized_end=1676
+  _globals['_SERVERTIMINGS']._serialized_start=1678
+  _globals['_SERVERTIMINGS']._serialized_end=1764
+  _globals['_LOADHINT']._serialized_start=1766
+  _globals['_LOADHINT']._serialized_end=1844
+  _globals['_POLICYSERVICE']._serialized_start=2181
+  _globals['_POLICYSERVICE']._serialized_end=2435
 # @@protoc_insertion_point(module_scope)

@@ -57,13 +57,15 @@ class CodedImages(_message.Message):
     def __init__(self, coding: _Optional[_Union[ImageCoding, str]] = ..., views: _Optional[_Iterable[_Union[CodedImage, _Mapping]]] = ..., follows_step: _Optional[int] = ...) -> None: ...
 
 class GetModelRequest(_message.Message):
-    __slots__ = ("protocol_version",)
+    __slots__ = ("protocol_version", "model")
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
     protocol_version: int
-    def __init__(self, protocol_version: _Optional[int] = ...) -> None: ...
+    model: str
+    def __init__(self, protocol_version: _Optional[int] = ..., model: _Optional[str] = ...) -> None: ...
 
 class GetModelResponse(_message.Message):
-    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size", "image_codings", "progressive", "run_options")
+    __slots__ = ("protocol_version", "model_name", "model_fingerprint", "num_tokens", "token_dim", "tower_dims", "grid", "action_horizon", "action_dim", "proprio_dim", "max_prompt_tokens", "delta_actions", "control_period_s", "quantizations", "max_request_bytes", "server_version", "image_size", "image_codings", "progressive", "run_options", "edge_fingerprints")
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_NAME_FIELD_NUMBER: _ClassVar[int]
     MODEL_FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
@@ -84,6 +86,7 @@ class GetModelResponse(_message.Message):
     IMAGE_CODINGS_FIELD_NUMBER: _ClassVar[int]
     PROGRESSIVE_FIELD_NUMBER: _ClassVar[int]
     RUN_OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    EDGE_FINGERPRINTS_FIELD_NUMBER: _ClassVar[int]
     protocol_version: int
     model_name: str
     model_fingerprint: str
@@ -104,10 +107,11 @@ class GetModelResponse(_message.Message):
     image_codings: _containers.RepeatedScalarFieldContainer[ImageCoding]
     progressive: bool
     run_options: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ..., image_codings: _Optional[_Iterable[_Union[ImageCoding, str]]] = ..., progressive: bool = ..., run_options: _Optional[_Iterable[str]] = ...) -> None: ...
+    edge_fingerprints: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, protocol_version: _Optional[int] = ..., model_name: _Optional[str] = ..., model_fingerprint: _Optional[str] = ..., num_tokens: _Optional[int] = ..., token_dim: _Optional[int] = ..., tower_dims: _Optional[_Iterable[int]] = ..., grid: _Optional[_Iterable[int]] = ..., action_horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., proprio_dim: _Optional[int] = ..., max_prompt_tokens: _Optional[int] = ..., delta_actions: _Optional[_Iterable[bool]] = ..., control_period_s: _Optional[float] = ..., quantizations: _Optional[_Iterable[_Union[Quantization, str]]] = ..., max_request_bytes: _Optional[int] = ..., server_version: _Optional[str] = ..., image_size: _Optional[_Iterable[int]] = ..., image_codings: _Optional[_Iterable[_Union[ImageCoding, str]]] = ..., progressive: bool = ..., run_options: _Optional[_Iterable[str]] = ..., edge_fingerprints: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class InferRequest(_message.Message):
-    __slots__ = ("session_id", "step", "instruction", "proprio", "payload", "model_fingerprint", "snr_db", "snr_age_s", "protocol_version", "images")
+    __slots__ = ("session_id", "step", "instruction", "proprio", "payload", "model_fingerprint", "snr_db", "snr_age_s", "protocol_version", "images", "model")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     INSTRUCTION_FIELD_NUMBER: _ClassVar[int]
@@ -118,6 +122,7 @@ class InferRequest(_message.Message):
     SNR_AGE_S_FIELD_NUMBER: _ClassVar[int]
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
     IMAGES_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     step: int
     instruction: str
@@ -128,7 +133,8 @@ class InferRequest(_message.Message):
     snr_age_s: float
     protocol_version: int
     images: CodedImages
-    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., instruction: _Optional[str] = ..., proprio: _Optional[_Iterable[float]] = ..., payload: _Optional[bytes] = ..., model_fingerprint: _Optional[str] = ..., snr_db: _Optional[float] = ..., snr_age_s: _Optional[float] = ..., protocol_version: _Optional[int] = ..., images: _Optional[_Union[CodedImages, _Mapping]] = ...) -> None: ...
+    model: str
+    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., instruction: _Optional[str] = ..., proprio: _Optional[_Iterable[float]] = ..., payload: _Optional[bytes] = ..., model_fingerprint: _Optional[str] = ..., snr_db: _Optional[float] = ..., snr_age_s: _Optional[float] = ..., protocol_version: _Optional[int] = ..., images: _Optional[_Union[CodedImages, _Mapping]] = ..., model: _Optional[str] = ...) -> None: ...
 
 class InferResponse(_message.Message):
     __slots__ = ("session_id", "step", "actions", "action_horizon", "action_dim", "tokens_used", "batch_size", "cloud_flops", "timings", "load", "model_fingerprint")

@@ -1,4 +1,4 @@
-"""``comvla-sim bench transport | edge | batching | model | wire | idle | overload | soak | fuzz``."""
+"""``comvla-sim bench``: one subcommand for each benchmark."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from comvla.number_arguments import number, whole
+from comvla_sim.bench import lifecycle_command
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -36,6 +37,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Runs one benchmark and prints its table, or JSON with ``--json``."""
+    if args.bench in lifecycle_command.RUNS:
+        return _print(lifecycle_command.RUNS[args.bench](args, _given), args.json)
     result = {
         "transport": _transport,
         "edge": _edge,
@@ -47,7 +50,11 @@ def run(args: argparse.Namespace) -> int:
         "soak": _soak,
         "fuzz": _fuzz,
     }[args.bench](args)
-    print(json.dumps(result, indent=2) if args.json else _text(result))
+    return _print(result, args.json)
+
+
+def _print(result: dict[str, Any], as_json: bool) -> int:
+    print(json.dumps(result, indent=2) if as_json else _text(result))
     return 0 if result.get("passed", True) else 1
 
 
@@ -191,6 +198,7 @@ _BENCHES: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
         _soak_options,
     ),
     "fuzz": ("hostile requests, against crashes, leaks and wrong status codes", _fuzz_options),
+    **lifecycle_command.BENCHES,
 }
 _UNREPEATED = {"overload", "soak", "fuzz"}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from comvla_sim.bench import lifecycle_report
 from comvla_sim.bench.table import milliseconds, percent, render
 
 _TIMES: dict[str, Callable[[Any], str]] = {
@@ -80,6 +81,7 @@ _HEADS = {
     "generator_cpu": "generator CPU %",
     "resident_mib": "resident MiB",
     "descriptors": "descriptors",
+    **lifecycle_report.HEADS,
 }
 
 
@@ -126,7 +128,7 @@ def _conclusions(result: Mapping[str, Any]) -> list[str]:
         return _soak_conclusions(result)
     if result["bench"] == "fuzz":
         return _fuzz_conclusions(result)
-    return []
+    return lifecycle_report.conclusions(result)
 
 
 def _idle_conclusions(result: Mapping[str, Any]) -> list[str]:

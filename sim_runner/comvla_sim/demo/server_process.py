@@ -37,6 +37,8 @@ class ServerProcess:
         insecure: listens without encryption also where others might reach it.
         launcher: a program that becomes the one whose command line follows it, e.g. in another
             network namespace.
+        port, admin_port: to take, 0 for free ones.
+        options: further ones of ``serve``.
 
     Attributes:
         target: ``host:port`` of the gRPC service, once entered.
@@ -54,10 +56,14 @@ class ServerProcess:
         host: str = "127.0.0.1",
         insecure: bool = False,
         launcher: Sequence[str] = (),
+        port: int = 0,
+        admin_port: int = 0,
+        options: Sequence[str] = (),
     ) -> None:
         self._command = [*launcher, sys.executable, "-m", "comvla_server", "serve"]
-        self._command += ["--model", model, "--host", host, "--port", "0", "--admin-port", "0"]
-        self._command += ["--threads", "1"]
+        self._command += ["--model", model, "--host", host]
+        self._command += ["--port", str(port), "--admin-port", str(admin_port), "--threads", "1"]
+        self._command += options
         self._command += ["--insecure"] if insecure else []
         self._ready_within_s = ready_within_s
         self._process: subprocess.Popen[str] | None = None
@@ -100,6 +106,24 @@ class ServerProcess:
         """Raises ServerProcessError when the server is gone."""
         if not self.running:
             raise ServerProcessError(f"the server ended in mid-episode{self._last_words()}")
+
+    @property
+    def pid(self) -> int:
+        """Of the process.
+
+        Raises:
+            ServerProcessError: it is gone.
+        """
+        self.require_running()
+        assert self._process is not None
+        return self._process.pid
+
+    def kill(self) -> None:
+        """Ends the server without a word to anybody, as a lost machine does."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        self.stop()
 
     def stop(self) -> None:
         """Lets the server drain, and ends it where it does not; harmless when repeated."""

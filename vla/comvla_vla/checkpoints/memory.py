@@ -12,7 +12,13 @@ WORKING_BYTES = 256 * 2**20
 
 
 def available_bytes() -> int | None:
-    """Memory that can be had without swapping; None where the system does not tell (not Linux)."""
+    """Memory that can be had without swapping, on this machine and in this container; None where the system does
+    not tell (not Linux)."""
+    known = [room for room in (_machine_bytes(), _container_bytes()) if room is not None]
+    return min(known, default=None)
+
+
+def _machine_bytes() -> int | None:
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
@@ -21,6 +27,20 @@ def available_bytes() -> int | None:
         if line.startswith("MemAvailable:"):
             return int(line.split()[1]) * 1024
     return None
+
+
+def _container_bytes(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """What is left of a limit (control groups, version 2); whoever goes beyond it is killed without a word."""
+    try:
+        limit, used = ((folder / f"memory.{name}").read_text() for name in ("max", "current"))
+        lines = (folder / "memory.stat").read_text().splitlines()
+    except OSError:
+        return None
+    if limit.strip() == "max":
+        return None
+    # Pages of files that were read once are given up first.
+    cached = sum(int(line.split()[1]) for line in lines if line.startswith("inactive_file "))
+    return max(0, int(limit) - int(used) + cached)
 
 
 def check_memory(weight_bytes: int, what: str) -> None:

@@ -1,0 +1,165 @@
+"""Whose turn it is among several servers, and which of them had better be left alone."""
+
+from __future__ import annotations
+
+import random
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar
+
+from comvla_client.errors import TransportError
+from comvla_client.revival import PATIENCE_S, USUAL_TIMES
+from comvla_client.targets import Address
+
+PROBE_EVERY_S = 0.1
+"""Pause between two questions to a server that is down whether it is back, in seconds."""
+
+PROBE_TIMEOUT_S = 0.5
+"""How long each may take."""
+
+FOREIGN_FOR_S = 30.0
+"""How long a server that runs another model is left alone."""
+
+LOOK_UP_EVERY_S = 30.0
+"""How often a name is looked up again while all is well."""
+
+ELSEWHERE = frozenset({"UNAVAILABLE", "FAILED_PRECONDITION", "NOT_FOUND", "UNIMPLEMENTED"})
+"""Codes of one server that say nothing of the others."""
+
+_REMEMBERED = 9
+
+
+class Closes(Protocol):
+    """What a member needs of its transport."""
+
+    def close(self) -> object:
+        """Ends calls under way and frees the connection."""
+
+
+T = TypeVar("T", bound=Closes)
+
+
+@dataclass(eq=False)
+class Member(Generic[T]):
+    """One server.
+
+    Attributes:
+        address: where it is.
+        transport: calls it.
+        down: not to be asked while others are there.
+        probe_at: when to ask it whether it is back, on ``time.monotonic``.
+        calls: under way.
+        took_s: seconds of its last answers.
+    """
+
+    address: Address
+    transport: T
+    down: bool = False
+    probe_at: float = 0.0
+    calls: int = 0
+    took_s: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+
+    @property
+    def patience_s(self) -> float:
+        """How long a call may take before something seems to be wrong, in seconds."""
+        usual_s = statistics.median(self.took_s) if self.took_s else 0.0
+        return max(PATIENCE_S, USUAL_TIMES * usual_s)
+
+
+class Roster(Generic[T]):
+    """Takes turns. May be used from several threads.
+
+    Args:
+        make: a transport to an address.
+    """
+
+    def __init__(self, make: Callable[[Address], T]) -> None:
+        self._make = make
+        self._lock = threading.Lock()
+        self._members: list[Member[T]] = []
+        # Robots that start together begin at different servers.
+        self._turn = random.SystemRandom().randrange(1024)
+
+    @property
+    def members(self) -> list[Member[T]]:
+        """Everybody."""
+        with self._lock:
+            return list(self._members)
+
+    @property
+    def down(self) -> list[Member[T]]:
+        """Those that had better be left alone."""
+        return [member for member in self.members if member.down]
+
+    def update(self, addresses: Iterable[Address]) -> list[Member[T]]:
+        """Takes over what a look-up found; nothing at all is taken for a look-up that failed.
+
+        Returns:
+            Those that are gone; their transports are the caller's to close.
+        """
+        wanted = list(addresses)
+        with self._lock:
+            known = {member.address: member for member in self._members}
+            if not wanted:
+                return []
+            self._members = [known.get(a) or Member(a, self._make(a)) for a in wanted]
+            return [member for a, member in known.items() if a not in wanted]
+
+    def pick(self, tried: Collection[Member[T]] = ()) -> Member[T] | None:
+        """Whose turn it is: of those who are well the next that is idle, or at least the next.
+
+        Args:
+            tried: who was asked already and had no answer.
+
+        Returns:
+            None where everybody was asked.
+        """
+        with self._lock:
+            count = len(self._members)
+            order = [self._members[(self._turn + i) % count] for i in range(count)]
+            left = [member for member in order if member not in tried]
+            if not left:
+                return None
+            # Sorting is stable: of equals the next in turn comes first.
+            chosen = min(left, key=lambda member: (member.down, member.calls))
+            self._turn = self._members.index(chosen) + 1
+            return chosen
+
+    def begin(self, member: Member[T]) -> None:
+        """A call sets out."""
+        with self._lock:
+            member.calls += 1
+
+    def end(self, member: Member[T]) -> None:
+        """A call is over."""
+        with self._lock:
+            member.calls -= 1
+
+    def answered(self, member: Member[T], took_s: float) -> None:
+        """A call was answered."""
+        member.took_s.append(took_s)
+        member.down = False
+
+    def failed(self, member: Member[T], error: TransportError) -> None:
+        """A call was not, and that says something of the server."""
+        if error.code not in ELSEWHERE:
+            return
+        pause_s = 0.0 if error.code == "UNAVAILABLE" else FOREIGN_FOR_S
+        self.leave(member, pause_s)
+
+    def leave(self, member: Member[T], pause_s: float = 0.0) -> None:
+        """A server had better be left alone for so long, and until it says that it is well."""
+        member.down, member.probe_at = True, time.monotonic() + pause_s
+
+    def back(self, member: Member[T]) -> None:
+        """It said so."""
+        member.down = False
+
+
+def worst(errors: list[TransportError]) -> TransportError:
+    """The failure to tell where every server had one: that of a server which is there, if any is."""
+    return next((error for error in errors if error.code != "UNAVAILABLE"), errors[-1])

@@ -1,0 +1,321 @@
+"""Replaces a model while robots use it: the new one is loaded and warmed up beside the old one, which
+answers until a single step switches over, finishes what it has begun, and is let go.
+
+Whatever goes wrong before that step leaves the old one serving.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import time
+import weakref
+from collections.abc import Awaitable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, TypeVar
+
+from comvla import handshake
+from comvla.errors import ComVLAError
+from comvla_server.engine import Engine
+from comvla_server.inference_thread import InferenceThread
+from comvla_server.lifecycle import Lifecycle
+from comvla_server.metrics import Metrics
+from comvla_server.model_loading import Candidate, Loader
+from comvla_server.models import Models, Runtime
+from comvla_server.refusals import Refusal
+from comvla_server.runtimes import Runtimes
+from comvla_server.settings import ServerSettings
+from comvla_server.version import server_version
+from comvla_server.vision import VisionHalf
+from comvla_server.wording import shown
+
+_log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
+
+Trouble: TypeAlias = Literal["unknown", "busy", "robots", "memory", "checkpoint", "stopping"]
+"""Why a model was not replaced."""
+
+
+class SwapError(ComVLAError):
+    """A model that was not replaced; the one there goes on.
+
+    Attributes:
+        trouble: the cause.
+    """
+
+    def __init__(self, trouble: Trouble, message: str) -> None:
+        super().__init__(message)
+        self.trouble: Trouble = trouble
+
+
+@dataclass(frozen=True)
+class SwapReport:
+    """What was replaced by what.
+
+    Attributes:
+        model: name under which robots ask for it; empty for one without a name.
+        source: the new checkpoint.
+        before: fingerprint of the old model.
+        after: fingerprint of the new one.
+        robots: what it means for them: ``same`` model, ``compatible`` (another cloud half for the
+            same edge half), or ``new_edge`` (they have to load another edge half).
+        needed_bytes: memory for the new model, beside the old one.
+        available_bytes: memory there was; None where nobody tells.
+        swapped: False where it was only checked.
+        load_s: seconds that loading took, while the old model answered.
+        warm_up_s: seconds of the first forward passes, likewise.
+        drain_s: seconds until the old model had answered the last call that it had taken.
+        freed: whether the old model's memory was given back by then; else that follows.
+    """
+
+    model: str
+    source: str
+    before: str
+    after: str
+    robots: Literal["same", "compatible", "new_edge"]
+    needed_bytes: int
+    available_bytes: int | None
+    swapped: bool = False
+    load_s: float = 0.0
+    warm_up_s: float = 0.0
+    drain_s: float = 0.0
+    freed: bool = False
+
+
+class Swapper:
+    """Replaces models of one server, one at a time. Used from its event loop only.
+
+    Args:
+        models: what answers.
+        runtimes: puts engines behind their queues.
+        loader: finds and loads checkpoints.
+        lifecycle: nothing is replaced unless the server is ready.
+        metrics: say which models answer.
+        settings: largest batch, and how long to wait for calls under way.
+        sources: the checkpoint behind each name.
+    """
+
+    def __init__(
+        self,
+        models: Models,
+        runtimes: Runtimes,
+        loader: Loader,
+        lifecycle: Lifecycle,
+        metrics: Metrics,
+        settings: ServerSettings,
+        sources: Mapping[str, str],
+    ) -> None:
+        self._models = models
+        self._runtimes = runtimes
+        self._loader = loader
+        self._lifecycle = lifecycle
+        self._metrics = metrics
+        self._settings = settings
+        self.sources = dict(sources)
+        self._busy = ""
+        self._retiring: set[asyncio.Task[bool]] = set()
+
+    @property
+    def busy(self) -> str:
+        """What is being done, empty where nothing is."""
+        return self._busy
+
+    async def swap(
+        self, model: str, source: str, *, new_edge: bool = False, check: bool = False
+    ) -> SwapReport:
+        """Replaces one model.
+
+        Args:
+            model: name of the one to replace; empty for the default.
+            source: the new checkpoint.
+            new_edge: also one with another edge half than the robots have. They are then told so at
+                their next step, and stop.
+            check: only say what would happen, and what it takes.
+
+        Raises:
+            SwapError: nothing was replaced.
+        """
+        if self._busy:
+            raise SwapError(
+                "busy", f"the server is {self._busy}: expected one swap at a time; retry after it"
+            )
+        self._busy = f"loading {shown(source)}"
+        thread = InferenceThread("comvla-load")
+        try:
+            return await self._swap(thread, self._find(model), source, new_edge, check)
+        finally:
+            self._busy = ""
+            thread.close(timeout_s=0.0)
+
+    async def refresh(self) -> list[SwapReport]:
+        """Replaces every model whose checkpoint is another by now; those that are not stay.
+
+        Raises:
+            SwapError: a checkpoint that cannot be used, or that robots could not work with.
+        """
+        reports = []
+        for runtime in self._models:
+            source = self.sources.get(runtime.name)
+            if source is None:
+                continue
+            there = await self.swap(runtime.name, source, check=True)
+            if there.after != there.before:
+                reports.append(await self.swap(runtime.name, source))
+        return reports
+
+    def close(self) -> None:
+        """Waits for nothing any more."""
+        for task in self._retiring:
+            task.cancel()
+
+    def _find(self, model: str) -> Runtime:
+        try:
+            self._lifecycle.require_ready()
+        except Refusal as refusal:
+            raise SwapError("stopping", refusal.message) from refusal
+        try:
+            return self._models.find(model)
+        except Refusal as refusal:
+            raise SwapError(
+                "unknown",
+                f"expected the name of a model that is served here ({self._models.shown_names()}), "
+                f"got {shown(model)}",
+            ) from refusal
+
+    async def _swap(
+        self, thread: InferenceThread, old: Runtime, source: str, new_edge: bool, check: bool
+    ) -> SwapReport:
+        candidate = await _trying(thread.run(self._loader.inspect, source), source)
+        report = self._compare(old, candidate)
+        if check:
+            return report
+        if report.robots == "new_edge" and not new_edge:
+            difference = handshake.mismatch(old.engine.info, candidate.info)
+            raise SwapError(
+                "robots",
+                f"robots hold the edge half of {old.engine.info.name} and cannot work with "
+                f"{shown(source)}: {difference}. Swap to a checkpoint with the same edge half, or give "
+                "new_edge (--new-edge): robots then stop until they have the new edge half",
+            )
+        there = candidate.available_bytes
+        if there is not None and there < candidate.needed_bytes:
+            raise SwapError(
+                "memory",
+                f"{shown(source)} needs {_gigabytes(candidate.needed_bytes)} of memory beside the model "
+                f"that serves, {_gigabytes(there)} are available: free memory, use a narrower --dtype, "
+                "or start a server of the new model elsewhere and drain this one",
+            )
+        began = time.monotonic()
+        engine = await _trying(thread.run(self._load, source, old.engine), source)
+        loaded = time.monotonic()
+        self._busy = f"warming up {shown(source)}"
+        await _trying(thread.run(engine.warm_up, self._settings.max_batch), source)
+        warm = time.monotonic()
+        self._find(old.name)  # the server may have begun to stop meanwhile
+        self._switch(old, engine, report, candidate)
+        self._busy = f"letting {old.label} finish its calls"
+        ref = weakref.ref(old.engine)
+        retiring = asyncio.ensure_future(self._retire(old))
+        del old, engine
+        self._retiring.add(retiring)
+        retiring.add_done_callback(self._retiring.discard)
+        await asyncio.wait([retiring], timeout=self._settings.grace_s)
+        done = replace(
+            report,
+            swapped=True,
+            load_s=loaded - began,
+            warm_up_s=warm - loaded,
+            drain_s=time.monotonic() - warm,
+            freed=retiring.done() and _freed(ref),
+        )
+        _log.info(
+            "model %s replaced",
+            done.model or "default",
+            extra={"before": done.before, "after": done.after},
+        )
+        return done
+
+    def _compare(self, old: Runtime, candidate: Candidate) -> SwapReport:
+        before, after = old.engine.info, candidate.info
+        robots: Literal["same", "compatible", "new_edge"] = "new_edge"
+        if handshake.mismatch(before, after) is None:
+            robots = "same"
+        elif handshake.mismatch(before, replace(after, fingerprint=before.fingerprint)) is None:
+            identity = old.engine.edge_identity
+            if identity is not None and identity == candidate.edge_identity:
+                robots = "compatible"
+        return SwapReport(
+            model=old.name,
+            source=candidate.source,
+            before=before.fingerprint,
+            after=after.fingerprint,
+            robots=robots,
+            needed_bytes=candidate.needed_bytes,
+            available_bytes=candidate.available_bytes,
+        )
+
+    def _load(self, source: str, old: Engine) -> Engine:
+        engine = self._loader.load(source)
+        self._runtimes.check_message_cap(engine)
+        if isinstance(engine.vision, VisionHalf) and old.vision is not None:
+            # Decoders know no model, and hold the streams that robots' next pictures build on.
+            engine.vision.keep_decoders(old.vision)
+        return engine
+
+    def _switch(
+        self, old: Runtime, engine: Engine, report: SwapReport, candidate: Candidate
+    ) -> None:
+        also: frozenset[str] = frozenset()
+        if report.robots != "new_edge":
+            also = old.validator.also | {report.before}
+        runtime = self._runtimes.make(engine, old.name, also - {report.after})
+        runtime.batcher.adopt_sessions(old.batcher)
+        self._models.put(runtime)
+        self.sources[old.name] = candidate.source
+        infos = [runtime.engine.info for runtime in self._models]
+        if all(info.fingerprint != report.before for info in infos):
+            self._metrics.forget_model(old.engine.info, server_version())
+        self._metrics.describe_model(engine.info, server_version())
+
+    async def _retire(self, old: Runtime) -> bool:
+        await old.users.none.wait()
+        await old.batcher.close()
+        return True
+
+
+async def _trying(work: Awaitable[_T], source: str) -> _T:
+    """What a step towards the new model gives; whatever it raises leaves the old one serving."""
+    try:
+        return await work
+    except ComVLAError as error:
+        raise SwapError("checkpoint", f"{shown(source)}: {error}") from error
+    except MemoryError as error:
+        raise SwapError("memory", f"{shown(source)} does not fit in memory: free some") from error
+    except Exception as error:  # torch and safetensors raise many kinds
+        _log.exception("a model could not be made ready")
+        raise SwapError(
+            "checkpoint",
+            f"{shown(source)} could not be made ready ({type(error).__name__}: {error}): the model that "
+            "serves goes on; the server's log says more",
+        ) from error
+
+
+def _freed(engine: weakref.ref[Engine]) -> bool:
+    """Whether a model is gone; where only cycles hold it, they are cut.
+
+    A server freezes what it has loaded out of garbage collection, which is also why a collection is
+    tried only where it is needed: it halts everything for as long as it takes to walk through torch.
+    """
+    frozen = gc.get_freeze_count() > 0
+    if engine() is not None:
+        gc.unfreeze()
+        gc.collect()
+    if frozen:
+        gc.freeze()
+    return engine() is None
+
+
+def _gigabytes(nbytes: int) -> str:
+    return f"{nbytes / 1e9:.3g} GB"

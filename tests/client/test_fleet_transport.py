@@ -1,0 +1,279 @@
+"""Several servers that answer alike: turns, and no step lost when one of them is gone, silent, or another model's."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+from client_stubs import NARROW, WORDS, StubEdge, StubService, observation, other_model, serving
+from frozen_proxy import FrozenProxy
+
+from comvla.errors import HandshakeError
+from comvla_client import AsyncComVLAClient, ClientClosedError, ComVLAClient
+from comvla_client.fleet import FleetTransport
+from comvla_client.roster import Roster
+from comvla_client.targets import Address, Addresses, is_fleet
+
+OBS = observation()
+REFUSED = "127.0.0.1:1"
+OPTIONS: dict[str, Any] = {"link": NARROW, "budget": 4, "deadline_s": 20.0}
+
+
+def client_of(*targets: str, **options: Any) -> ComVLAClient:
+    return ComVLAClient(",".join(targets), edge=StubEdge(), **{**OPTIONS, **options})
+
+
+def eventually(claim: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 30.0
+    while not claim():
+        assert time.monotonic() < deadline_s, "it never came true"
+        time.sleep(0.005)
+
+
+@contextmanager
+def two_servers() -> Iterator[tuple[tuple[str, StubService], tuple[str, StubService]]]:
+    with serving() as one, serving() as other:
+        yield one, other
+
+
+def test_servers_take_turns() -> None:
+    with two_servers() as ((a, one), (b, other)), client_of(a, b) as client:
+        assert all(client.step(OBS, WORDS).source == "cloud" for _ in range(10))
+    assert len(one.requests) == len(other.requests) == 5
+    steps = {request.step for request in one.requests + other.requests}
+    assert steps == set(range(10)), "each step was sent once"
+
+
+def test_no_step_is_lost_when_one_goes_and_it_is_asked_again_when_it_is_back() -> None:
+    with serving() as (a, one):
+        with ExitStack() as second:
+            b, _ = second.enter_context(serving())
+            client = client_of(a, b)
+            for _ in range(4):
+                assert client.step(OBS, WORDS).source == "cloud"
+            second.close()
+            for _ in range(4):
+                assert client.step(OBS, WORDS).source == "cloud"
+        with serving(port=int(b.rpartition(":")[2])) as (_, again):
+
+            def asked() -> bool:
+                assert client.step(OBS, WORDS).source == "cloud"
+                return bool(again.requests)
+
+            eventually(asked)
+        client.close()
+    assert one.requests
+
+
+def test_a_server_that_went_silent_costs_no_step() -> None:
+    with two_servers() as ((a, _), (b, other)):
+        proxy = FrozenProxy(int(a.rpartition(":")[2]))
+        with client_of(proxy.target, b) as client:
+            for _ in range(4):
+                assert client.step(OBS, WORDS).source == "cloud"
+            proxy.freeze()
+            before = len(other.requests)
+            for _ in range(6):
+                assert client.step(OBS, WORDS).source == "cloud"
+            assert len(other.requests) == before + 6
+            proxy.thaw()
+
+            def back() -> bool:
+                count = len(other.requests)
+                assert client.step(OBS, WORDS).source == "cloud"
+                return len(other.requests) == count
+
+            eventually(back)
+
+
+def test_a_server_that_is_merely_slow_is_waited_for_and_nothing_sent_twice() -> None:
+    with two_servers() as ((a, one), (b, other)):
+        for service in (one, other):
+            service.before = lambda *_: time.sleep(0.3)
+        with client_of(a, b) as client:
+            for _ in range(4):
+                assert client.step(OBS, WORDS).source == "cloud"
+    assert len(one.requests) + len(other.requests) == 4
+
+
+def test_a_server_of_another_model_is_left_out() -> None:
+    with serving() as (a, one), serving() as (b, other), client_of(a, b) as client:
+        assert client.step(OBS, WORDS).source == "cloud"
+        other.info = other_model(fingerprint="0ther")  # replaced while the robot runs
+        for _ in range(6):
+            assert client.step(OBS, WORDS).source == "cloud"
+        assert len(other.requests) <= 2
+        one.info = other.info
+        with pytest.raises(HandshakeError, match="another model"):
+            client.step(OBS, WORDS)
+
+
+def test_all_gone_is_a_fallback_and_the_first_to_return_is_found() -> None:
+    with ExitStack() as servers:
+        (a, _), (b, _) = (servers.enter_context(serving()) for _ in range(2))
+        client = client_of(a, b, deadline_s=0.5)
+        assert client.step(OBS, WORDS).source == "cloud"
+        servers.close()
+        for _ in range(3):
+            assert client.step(OBS, WORDS).report.fallback_reason == "unavailable"
+    with serving(port=int(b.rpartition(":")[2])):
+        eventually(lambda: client.step(OBS, WORDS).source == "cloud")
+    client.close()
+
+
+def test_a_name_stands_for_its_servers() -> None:
+    with serving() as (a, service):
+        target = f"dns:///localhost:{a.rpartition(':')[2]}"
+        with client_of(target) as client:
+            for _ in range(4):
+                assert client.step(OBS, WORDS).source == "cloud"
+    assert len(service.requests) == 4
+
+
+def test_a_name_is_looked_up_again_when_a_server_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ExitStack() as first, serving() as (b, other):
+        a, _ = first.enter_context(serving())
+        known = [a]
+
+        def look_up(self: Addresses) -> list[Address]:
+            return [Address(target, "fleet") for target in known]
+
+        monkeypatch.setattr(Addresses, "look_up", look_up)
+        with client_of("dns:///fleet:1") as client:
+            assert client.step(OBS, WORDS).source == "cloud"
+            first.close()
+            known[:] = [b]
+            assert client.step(OBS, WORDS).source == "cloud"
+    assert len(other.requests) == 1
+
+
+def test_a_name_that_nobody_knows() -> None:
+    with pytest.raises(HandshakeError, match="stands for no server"):
+        client_of("dns:///nowhere.invalid:1", connect_timeout_s=0.2)
+
+
+@pytest.mark.parametrize(
+    "target", ["a:1,", ",a:1", "a:1,b", "a:1,http://b:1", "dns:///a", "dns:///"]
+)
+def test_what_is_no_address_is_refused(target: str) -> None:
+    with pytest.raises(HandshakeError, match="expected a target host:port"):
+        client_of(target)
+
+
+def test_warm_up_is_for_one_connection() -> None:
+    with pytest.raises(ValueError, match="take turns"):
+        client_of("a:1", "b:1", warm_up=True)
+
+
+def test_closing_ends_a_step_in_another_thread() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent, serving() as (a, service):
+        entered = threading.Event()
+
+        def wait(request: Any, context: Any) -> None:
+            entered.set()
+            context.add_callback(released.set)
+            released.wait(20.0)
+
+        released = threading.Event()
+        client = client_of(a, f"127.0.0.1:{silent.getsockname()[1]}")
+        service.before = wait
+        ended: list[BaseException] = []
+
+        def step() -> None:
+            try:
+                client.step(OBS, WORDS)
+            except BaseException as error:
+                ended.append(error)
+
+        thread = threading.Thread(target=step)
+        thread.start()
+        assert entered.wait(20.0)
+        client.close()
+        thread.join(20.0)
+        assert not thread.is_alive()
+        assert [type(error) for error in ended] == [ClientClosedError]
+        with pytest.raises(ClientClosedError):
+            client.step(OBS, WORDS)
+
+
+def test_a_fleet_of_tokens_asks_for_tls_at_every_address() -> None:
+    from comvla_client.access import AccessError
+
+    with pytest.raises(AccessError, match=r"192\.0\.2\.1:1 in the clear"):
+        FleetTransport("127.0.0.1:1,192.0.2.1:1", token="secret")
+
+
+def test_the_next_in_turn_is_who_is_well_and_idle() -> None:
+    class Transport:
+        def close(self) -> None:
+            pass
+
+    roster = Roster(lambda address: Transport())
+    roster.update([Address(f"host:{i}") for i in range(1, 5)])
+    a, b, c, d = roster.members
+    assert {id(roster.pick()) for _ in range(4)} == {id(m) for m in (a, b, c, d)}
+    roster.leave(a)
+    roster.begin(b)
+    assert {id(roster.pick()) for _ in range(4)} == {id(c), id(d)}
+    assert roster.pick([c, d]) is b
+    assert roster.pick([b, c, d]) is a
+    assert roster.pick([a, b, c, d]) is None
+    assert roster.update([]) == []
+    assert roster.update([c.address, Address("host:9")]) == [a, b, d]
+    assert roster.members[0] is c
+
+
+def test_what_is_a_fleet() -> None:
+    assert [is_fleet(t) for t in ("a:1", "a:1,b:1", "dns:///a:1")] == [False, True, True]
+
+
+async def test_the_asyncio_client_takes_turns_and_loses_no_step() -> None:
+    with serving() as (a, one), serving() as (b, other):
+        proxy = FrozenProxy(int(b.rpartition(":")[2]))
+        client = AsyncComVLAClient(f"{a},{proxy.target},{REFUSED}", edge=StubEdge(), **OPTIONS)
+        async with client:
+            for _ in range(6):
+                assert (await client.step(OBS, WORDS)).source == "cloud"
+            assert one.requests
+            assert other.requests
+            proxy.freeze()
+            before = len(one.requests)
+            for _ in range(4):
+                assert (await client.step(OBS, WORDS)).source == "cloud"
+            assert len(one.requests) == before + 4
+            proxy.thaw()
+            for _ in range(3000):
+                count = len(other.requests)
+                assert (await client.step(OBS, WORDS)).source == "cloud"
+                if len(other.requests) > count:
+                    break
+                await asyncio.sleep(0.005)
+            else:
+                pytest.fail("the server that came back was never asked again")
+
+
+async def test_the_asyncio_client_ends_a_call_that_its_task_gives_up() -> None:
+    with serving() as (a, service), serving() as (b, other):
+        async with AsyncComVLAClient(f"{a},{b}", edge=StubEdge(), **OPTIONS) as client:
+            assert (await client.step(OBS, WORDS)).source == "cloud"
+            ended = threading.Event()
+            began = threading.Event()
+
+            def wait(request: Any, context: Any) -> None:
+                context.add_callback(ended.set)
+                began.set()
+                ended.wait(20.0)
+
+            service.before = other.before = wait
+            step = asyncio.ensure_future(client.step(OBS, WORDS))
+            assert await asyncio.to_thread(began.wait, 20.0)
+            step.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await step
+            assert await asyncio.to_thread(ended.wait, 20.0)

@@ -1,0 +1,140 @@
+"""The service behind Ray Serve's gRPC proxy: answers, refusals, and the loss of a replica."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from server_stubs import PATIENCE_S, Robot
+
+from comvla.errors import ComVLAError
+from comvla_server import cli
+from comvla_server.identity import Identity
+from comvla_server.settings import SettingsError
+from comvla_server.tokens import TokenLine
+from comvla_vla import random_policy, save_policy
+from comvla_vla.random import unit_statistics
+
+TOKEN = "cvt_robot"
+needs_ray = pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None,
+    reason="Ray is not installed: pip install 'comvla[ray]'",
+)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--port", "50051"), "give --insecure"),
+        (("--port", "0", "--insecure"), "name one"),
+        (("--insecure", "--admin-tokens-file", "x"), "admin_tokens_file cannot be kept"),
+    ],
+)
+def test_what_rays_proxy_cannot_keep_is_refused(
+    arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["ray", *arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert issubclass(SettingsError, ComVLAError)
+
+
+def test_without_ray_the_extra_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert cli.main(["ray", "--insecure"]) == 2
+    assert "pip install 'comvla[ray]'" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Two replicas of a policy with random weights, with tokens, started by the real command."""
+    folder: Path = tmp_path_factory.mktemp("ray")
+    edge, cloud = random_policy(seed=0)
+    statistics = unit_statistics(edge.config)
+    save_policy(folder / "policy", edge.net, cloud.net, edge.prompt.tokenizer, statistics)
+    tokens = folder / "tokens"
+    tokens.write_text(f"{TokenLine.of(Identity('arm-7'), TOKEN)}\n")
+    tokens.chmod(0o600)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "comvla_server", "ray", "--insecure", "--replicas", "2"]
+    command += ["--model", str(folder / "policy"), "--port", str(port), "--threads", "1"]
+    command += ["--tokens-file", str(tokens), "--default-deadline-s", "30"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
+    )
+    try:
+        assert process.stdout is not None
+        line = next((x for x in process.stdout if x.startswith("comvla-server ready")), "")
+        assert f"grpc=127.0.0.1:{port} " in line
+        assert line.endswith("replicas=2\n")
+        yield f"127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        assert process.wait(PATIENCE_S) == 0
+
+
+@needs_ray
+@pytest.mark.slow
+def test_robots_are_answered_refused_and_carried_over_the_loss_of_a_replica(target: str) -> None:
+    import numpy as np
+
+    from comvla.v1 import policy_pb2
+    from comvla_client import ComVLAClient
+    from comvla_client.health import check_health
+    from comvla_sim.bench.replicas import _kill_replica
+
+    edge, _ = random_policy(seed=0)
+    info = edge.info
+    observation = {
+        "images": [np.zeros((*info.image_size, 3), np.uint8)] * info.grid[0],
+        "proprio": np.zeros(info.proprio_dim),
+    }
+    options: dict[str, Any] = {"edge": edge, "budget": 8, "deadline_s": 30.0, "token": TOKEN}
+    with ComVLAClient(target, **options) as client:
+        for _ in range(6):
+            assert client.step(observation, "push the button").source == "cloud"
+        _kill_replica(_starter(target))
+        for _ in range(20):
+            report = client.step(observation, "push the button").report
+            assert report.source == "cloud", report.detail
+        assert check_health(client._transport.access, PATIENCE_S) == "SERVING"  # type: ignore[attr-defined]
+    with ComVLAClient(target, sending="progressive", snr=30.0, **options) as client:
+        report = client.step(observation, "push the button").report
+        assert report.source == "cloud", report.detail
+    with Robot(target) as robot:
+        code, words = robot.refused(policy_pb2.InferRequest())
+        assert code is grpc.StatusCode.UNAUTHENTICATED
+        assert "comvla-server token new" in words
+        call = robot.stub.Infer.future(
+            policy_pb2.InferRequest(),
+            timeout=PATIENCE_S,
+            metadata=[("authorization", f"Bearer {TOKEN}")],
+        )
+        error = call.exception(timeout=PATIENCE_S)
+        assert error.code() is grpc.StatusCode.FAILED_PRECONDITION
+        assert "protocol version" in error.details()
+
+
+def _starter(target: str) -> int:
+    """The process that started the replicas: a child of this one."""
+    port = target.rpartition(":")[2].encode()
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            try:
+                words = Path(f"/proc/{name}/cmdline").read_bytes().split(b"\0")
+            except OSError:
+                continue
+            if b"ray" in words and port in words:
+                return int(name)
+    raise AssertionError("nobody started replicas")
