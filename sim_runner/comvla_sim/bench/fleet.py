@@ -123,26 +123,28 @@ class Fleet:
     async def capacity(self, in_flight: int, seconds: float) -> float:
         """Answers per second where so many requests are always under way: the most that the server can do.
 
-        The first quarter of the time is not counted.
+        The first quarter of the time is not counted. It takes longer where no answer came by then.
         """
         began = time.perf_counter()
         counted_from, until = began + 0.25 * seconds, began + seconds
-        answers = 0
+        answers, last = 0, until
 
         async def keep_asking(robot: _Robot) -> None:
-            nonlocal answers
-            while time.perf_counter() < until:
+            nonlocal answers, last
+            while time.perf_counter() < until or not answers:
                 tally = Tally()
                 await robot.ask(self._tokens, TIMEOUT_S, tally)
                 if tally.failed or tally.late:
                     raise RuntimeError("a request was not answered while capacity was measured")
-                if counted_from <= time.perf_counter() < until:
+                now = time.perf_counter()
+                if counted_from <= now < until or (now >= until and not answers):
                     answers += tally.answered
+                    last = now
 
         self.begin(TIMEOUT_S)
         lanes = [self._robots[i % self._count].twin(i) for i in range(in_flight)]
         await asyncio.gather(*(keep_asking(lane) for lane in lanes))
-        return answers / (until - counted_from)
+        return answers / (max(until, last) - counted_from)
 
     async def offer(
         self,
