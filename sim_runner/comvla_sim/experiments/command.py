@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from comvla.number_arguments import whole
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.link_options import add_link_options, links_of, listed
-from comvla_sim.experiments.progress import cores, episode_bar, typed_command
+from comvla_sim.experiments.progress import Pace, cores, episode_bar, typed_command
 
 if TYPE_CHECKING:
     from comvla_sim.experiments.plan import EvalSettings
@@ -128,6 +128,7 @@ def run(args: argparse.Namespace) -> int:
     with ResultsFile(path, subject.settings) as results:
         done = sum(spec in results.rows for spec in specs)
         print(f"{path}: {done} of {len(specs)} episodes are there", file=sys.stderr)
+        pace = Pace()
         try:
             with episode_bar(len(specs), done) as on_row:
                 runner.run(
@@ -138,14 +139,17 @@ def run(args: argparse.Namespace) -> int:
                     story=runner.environment(settings, typed_command()),
                     workers=args.workers or cores(),
                     ray=args.ray,
-                    on_row=on_row,
+                    on_row=pace.counting(on_row),
                 )
         except KeyboardInterrupt:
             print(f"\nstopped; the same command goes on from {path}", file=sys.stderr)
             return 130
         summary = summarise(results.rows[spec] for spec in specs)
+    if pace.episodes:
+        print(pace, file=sys.stderr)
     if args.json:
-        print(json.dumps({"results": str(path), "settings": subject.settings, **summary}))
+        head = {"results": str(path), "settings": subject.settings, "pace": pace.to_dict()}
+        print(json.dumps({**head, **summary}))
     else:
         from comvla_sim.report.terminal import print_summary
 

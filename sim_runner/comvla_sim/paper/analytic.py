@@ -189,7 +189,9 @@ def inconsistencies() -> list[str]:
 
 
 def _averages() -> list[tuple[str, tuple[float, ...], float]]:
-    lines = [(f"{x.label} {x.config}", x.success, x.average) for x in TABLE1.values()]
+    lines: list[tuple[str, tuple[float, ...], float]] = [
+        (f"{x.label} {x.config}", x.success, x.average) for x in TABLE1.values()
+    ]
     lines += [(f"Table III {name}", success, mean) for name, (success, mean) in TABLE3.items()]
     return lines + [(f"Table IV {q}", success, mean) for q, (_, success, mean) in TABLE4.items()]
 
