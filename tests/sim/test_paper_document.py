@@ -11,8 +11,9 @@ from paper_stubs import a_few_cells, results, rows
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.paper import claims
 from comvla_sim.paper.cells import Cell
-from comvla_sim.paper.document import PICTURES, markdown
+from comvla_sim.paper.document import markdown
 from comvla_sim.paper.html import page
+from comvla_sim.paper.part import PICTURES
 from comvla_sim.paper.plot import success_against_bytes
 from comvla_sim.paper.published import SUITES, TABLE1
 from comvla_sim.paper.results import Results

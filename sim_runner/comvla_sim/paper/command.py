@@ -154,8 +154,9 @@ def write_documents(results: Results, out: Path) -> list[Path]:
     Raises:
         EvaluationError: a file cannot be written.
     """
-    from comvla_sim.paper.document import PICTURES, markdown
+    from comvla_sim.paper.document import markdown
     from comvla_sim.paper.html import page
+    from comvla_sim.paper.part import PICTURES
     from comvla_sim.paper.plot import success_against_bytes
     from comvla_sim.paper.results import write
 
@@ -179,7 +180,7 @@ def publish(results: Results, out: Path, docs: Path) -> list[Path]:
     Raises:
         EvaluationError: a file cannot be written.
     """
-    from comvla_sim.paper.document import PICTURES
+    from comvla_sim.paper.part import PICTURES
 
     files = []
     for name in ("results.md", "results.json", *(file for file, _ in PICTURES.values())):

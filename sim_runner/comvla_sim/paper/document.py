@@ -2,47 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-
-from comvla_sim.figures.series import SERIES
-from comvla_sim.paper import analytic, claims, tables2to4
+from comvla_sim.paper import analytic, claims, costs, tables2to4
 from comvla_sim.paper.cells import Cell
-from comvla_sim.paper.published import FIG4_OBJECT_5DB_RICIAN, FIG5_CLAIM
-from comvla_sim.paper.results import Json, Results
+from comvla_sim.paper.figure_parts import figure3, sweeps
+from comvla_sim.paper.part import PICTURES, Part
+from comvla_sim.paper.published import TABLE1
+from comvla_sim.paper.results import Results
 from comvla_sim.paper.table1 import counted_verdicts
 from comvla_sim.paper.table1 import tables as table1
 from comvla_sim.paper.verdicts import AGREES, DIFFERS, OURS, UNTESTED
-from comvla_sim.report.tables import Table, rate_with_interval
+from comvla_sim.report.tables import Table
 
 TITLE = "Results: the paper's tables and figures, measured here"
 
 WANTED_EPISODES = 20
 """Layouts for each instruction and method that a full run has."""
-
-PICTURES = {
-    "table1": ("results-bytes.svg", "Success against bytes on the wire, every method"),
-    "fig3": ("results-tokens.png", "Kept tokens by instruction, method and K"),
-    "film": ("results-episode.webp", "Kept tokens over an episode"),
-}
-"""File in docs/ and what it shows."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """One section.
-
-    Attributes:
-        title: heading.
-        words: paragraphs.
-        tables: in reading order.
-        pictures: keys of :data:`PICTURES`, or names of other files in docs/ with what they show.
-    """
-
-    title: str
-    words: Sequence[str] = ()
-    tables: Sequence[Table] = ()
-    pictures: Sequence[tuple[str, str]] = field(default=())
 
 
 def parts(results: Results) -> list[Part]:
@@ -55,7 +29,7 @@ def parts(results: Results) -> list[Part]:
             Part(
                 "Table I: every method",
                 _table1_words(results),
-                table1(results),
+                [*table1(results), *costs.tables(results)],
                 [PICTURES["table1"]],
             )
         )
@@ -66,8 +40,8 @@ def parts(results: Results) -> list[Part]:
             Part("Table IV: number formats", _table4_words(results), tables2to4.table4(results))
         )
     if data.get("figure3"):
-        found.append(_figure3(data["figure3"]))
-    found += _sweeps(results)
+        found.append(figure3(data["figure3"]))
+    found += sweeps(results)
     found.append(
         Part(
             "What does not fit together in the paper",
@@ -181,19 +155,26 @@ def _in_short(results: Results) -> list[str]:
 def _tables(results: Results) -> list[list[Table]]:
     found = [tables2to4.table2(results)]
     if results.data["cells"]:
-        found += [table1(results), tables2to4.table3(results), tables2to4.table4(results)]
+        found += [
+            table1(results),
+            costs.tables(results),
+            tables2to4.table3(results),
+            tables2to4.table4(results),
+        ]
     return found
 
 
 def _table1_words(results: Results) -> list[str]:
     words = []
-    full, random32 = results.find(Cell("full")), results.find(Cell("random", 32))
-    if full and random32 and not results.libero:
+    full, lot = results.rate(Cell("full")), results.rate(Cell("random", 32))
+    theirs = TABLE1["random", 32].average - TABLE1["full", None].average
+    if full and lot and not results.libero and 100 * (lot.value - full.value) < theirs:
         words.append(
-            "Random tokens fall far deeper here than in the paper. This policy never saw them in training, and a token "
-            "here sees a field of 16 pixels, where the paper's sees the whole picture: a random token of OpenVLA-OFT "
-            "still "
-            "knows what is elsewhere. The fair control, a policy trained on random tokens half of the time, is in the "
+            "Random tokens fall deeper here than in the paper. This policy never saw them in training, and its tokens "
+            "see "
+            "a field of 16 pixels, where a token of OpenVLA-OFT has attended to its whole picture and may know what "
+            "lies "
+            "elsewhere. The fair control, a policy trained on random tokens half of the time, is in the "
             "[model card](../vla/comvla_vla/policies/mini/README.md): 90.6 % with 32 random tokens against 97.5 % "
             "with 32 "
             "voted ones."
@@ -230,105 +211,6 @@ def _table4_words(results: Results) -> list[str]:
         "the "
         "paper's drop, and a scale for each channel would avoid it."
     ]
-
-
-def _figure3(found: Json) -> Part:
-    rows = [
-        (
-            line["method"],
-            str(line["k"]),
-            "–" if line["overlap"] is None else f"{100 * line['overlap']:.0f} %",
-            f"{line['object_kept']} of {line['instructions']}",
-        )
-        for line in found["overlaps"]
-    ]
-    words = [
-        "One picture, several instructions. What is bright crosses the link; a ring marks the thing that the words "
-        "name. "
-        "The paper shows one instruction of LIBERO; that votes gather on hand, object and goal, and random tokens "
-        "anywhere, "
-        "agrees with it.",
-    ]
-    pictures = [PICTURES["fig3"]]
-    film = found["film"]
-    if film:
-        ended = "until it is done" if film["success"] else "which it does not finish"
-        words.append(
-            f"The film is one episode of “{film['instruction']}” with {film['k']} tokens a query, {film['queries']} "
-            "queries, "
-            f"{ended}: above what the cameras see, below what was sent last."
-        )
-        pictures.append(PICTURES["film"])
-    table = Table(
-        "Kept tokens on this picture",
-        "Share of the K kept tokens that two of the instructions have in common, and for how many instructions the "
-        "named "
-        "thing's token is among them. One picture: an illustration, no statistic; over all frames see Table I's last "
-        "column.",
-        ("method", "K", "in common", "named thing kept"),
-        tuple(rows),
-    )
-    return Part("Fig. 3: which tokens are kept", words, [table], pictures)
-
-
-def _sweeps(results: Results) -> list[Part]:
-    found = []
-    for key, title, words, across, head in (
-        (
-            "fading",
-            "Fig. 4: success under fading",
-            f"The text of the paper gives two numbers of its figure: {FIG4_OBJECT_5DB_RICIAN['hard_voting']:.1f} % "
-            "for ComVLA "
-            f"and {FIG4_OBJECT_5DB_RICIAN['random']:.1f} % for random tokens (Object suite, Rician, 5 dB). “Not "
-            "enforced” is "
-            "its simulation: K follows the reported SNR, and everything arrives. The other lines run over a link that "
-            "really withholds what does not fit.",
-            "mean_snr_db",
-            "{:g} dB",
-        ),
-        (
-            "csi-delay",
-            "Fig. 5: stale channel state",
-            f"The paper says that stale reports “{FIG5_CLAIM}”, without numbers. d is the age of the report in control "
-            "periods.",
-            "csi_delay",
-            "d = {}",
-        ),
-    ):
-        sweep = results.data.get(key)
-        if not sweep or not sweep["points"]:
-            continue
-        tables = [
-            _sweep_table(channel, sweep["points"], across, head)
-            for channel in dict.fromkeys(p["axes"]["channel"] for p in sweep["points"])
-        ]
-        more = "More lines, what the link did, and a picture are in [fading.md](fading.md)."
-        caption = " ".join(sweep["caption"].split("\n"))
-        found.append(Part(title, [words, caption, more], tables))
-    return found
-
-
-def _sweep_table(channel: str, points: Sequence[Json], across: str, head: str) -> Table:
-    own = [point for point in points if point["axes"]["channel"] == channel]
-    columns = sorted({point["axes"][across] for point in own})
-    cells = {(p["series"], p["axes"][across]): p for p in own}
-    rows = []
-    for name in dict.fromkeys(point["series"] for point in own):
-        line = [cells.get((name, column)) for column in columns]
-        counts = sorted({point["episodes"] for point in line if point})
-        rows.append(
-            (
-                SERIES[name].label,
-                *("–" if point is None else rate_with_interval(point) for point in line),
-                " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))),
-            )
-        )
-    return Table(
-        f"{channel.capitalize()} fading",
-        "Percent of episodes with Wilson's 95 % intervals.",
-        ("line", *(head.format(column) for column in columns), "episodes a point"),
-        tuple(rows),
-    )
 
 
 def _renewing(results: Results) -> Part:

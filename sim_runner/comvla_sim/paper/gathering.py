@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ from comvla_sim.bench import environment
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout
 from comvla_sim.experiments.link_case import LinkCase
-from comvla_sim.experiments.plan import EvalSettings
 from comvla_sim.experiments.policy import shown_model
 from comvla_sim.figures.measuring import Study
 from comvla_sim.paper.cells import GROUPS, PAPER_CELLS, Cell, ordered
@@ -53,6 +53,8 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
         data["cells"], data["pairs"] = all_counts(measured), all_pairs(measured)
     if {"table1", "table2"} & set(tables):
         data["latency"] = _kept_or(plan, "latency", lambda: _latency(study, data))
+    if "table1" in tables and plan.world != "libero":
+        data["pictures"] = _kept_or(plan, "pictures", lambda: _pictures(plan, study, data))
     if "table4" in tables:
         data["layers"] = _kept_or(plan, "layers", lambda: _layers(study))
     if "fig3" in parts:
@@ -66,8 +68,6 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
 def _kept_or(plan: Plan, name: str, make: Any) -> Json:
     """A part that takes seconds: measured anew, or as it was measured last where nothing may run."""
     path = plan.out / f"{name}.json"
-    import json
-
     if plan.measured_only and path.exists():
         found: Json = json.loads(path.read_text(encoding="utf-8"))
         return found
@@ -85,6 +85,17 @@ def _latency(study: Study, data: Json) -> Json:
     return measure_latency(study, list(dict.fromkeys(wanted)))
 
 
+def _pictures(plan: Plan, study: Study, data: Json) -> Json:
+    from comvla_sim.experiments.worker import Worker
+    from comvla_sim.paper.picture_bytes import measure_picture_bytes
+
+    worker = Worker(study.settings)
+    try:
+        return measure_picture_bytes(worker, plan.seed, [c["method"] for c in data["cells"]])
+    finally:
+        worker.close()
+
+
 def _layers(study: Study) -> Json:
     from comvla_sim.paper.layer_error import measure_errors
 
@@ -96,7 +107,7 @@ def _figure3(plan: Plan, study: Study) -> Json:
     from comvla_sim.experiments.worker import Worker
     from comvla_sim.paper import film, kept_tokens
 
-    worker = Worker(EvalSettings(**vars(study.settings)))
+    worker = Worker(study.settings)
     try:
         layout = evaluation_layout(plan.seed, 0)
         scene = kept_tokens.select_on_one_picture(worker, layout)

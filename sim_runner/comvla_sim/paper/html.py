@@ -6,7 +6,8 @@ import re
 from html import escape
 from pathlib import Path
 
-from comvla_sim.paper.document import TITLE, Part, parts
+from comvla_sim.paper.document import TITLE, parts
+from comvla_sim.paper.part import Part
 from comvla_sim.paper.results import Results
 from comvla_sim.report.page import POLICY, data_uri, shared_style
 

@@ -63,7 +63,8 @@ _LINES = (
 )  # fmt: skip
 
 TABLE1: dict[tuple[str, int | None], PaperLine] = {
-    (method, k): PaperLine(*values) for method, k, *values in _LINES
+    (method, k): PaperLine(label, config, kib, tflops, latency_ms, success, average)
+    for method, k, label, config, kib, tflops, latency_ms, success, average in _LINES
 }
 """By method and K; None for methods that decide themselves what they send."""
 
