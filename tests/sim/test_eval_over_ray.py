@@ -60,11 +60,9 @@ def two_nodes() -> Iterator[str]:
     ray = pytest.importorskip("ray", reason="needs Ray: pip install 'comvla[ray]'")
     from ray.cluster_utils import Cluster
 
-    # A test's process has no usage to report, and nothing to show.
-    cluster = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
-    )
-    cluster.add_node(num_cpus=1)
+    node = {"num_cpus": 1, "object_store_memory": over_ray.STORE_BYTES}
+    cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+    cluster.add_node(**node)
     try:
         yield cluster.address
     finally:

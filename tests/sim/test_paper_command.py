@@ -95,6 +95,36 @@ def test_number_formats_share_what_is_measured_and_show_their_error(
     assert {"first", "second", "p_value"} <= set(printed["pairs"][0])
 
 
+def test_what_a_query_costs_is_measured_by_every_method(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert paper(tmp_path, "table1") == 0
+    printed = json.loads(capsys.readouterr().out)
+    timed = {(row["method"], row["k"]) for row in printed["latency"]["rows"]}
+    assert timed == {("full", None), ("hard_voting", 32), ("random", 32)}
+    assert all(row["edge_ms"] > 0 < row["cloud_ms"] for row in printed["latency"]["rows"])
+    assert printed["pictures"]["side"] == 224
+    assert printed["pictures"]["kib"]["jpeg-95"] > 1
+    (random,) = (row for row in printed["pairs"] if row["second"]["method"] == "random")
+    assert random["first"]["method"] == "hard_voting"
+    assert random["pairs"] == 8
+
+
+def test_stale_reports_take_over_what_a_figure_has_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gathering, "FIG5_SERIES", ("unenforced",))
+    figure = ["figure", "csi-delay", "--series", "unenforced", "--csi-delay", "0,1,2,3,4"]
+    options = ["--model", "random", "--episodes", "1", "--workers", "1"]
+    assert cli.main([*figure, *options, "--out", str(tmp_path / "figure")]) == 0
+    capsys.readouterr()
+    monkeypatch.setattr(Worker, "run", None)  # whoever runs an episode fails
+    assert paper(tmp_path / "paper", "fig5", "--reuse", str(tmp_path / "figure")) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [point["episodes"] for point in printed["csi-delay"]["points"]] == [8] * 5
+    assert any(table["part"].startswith("Fig. 5") for table in printed["tables"])
+
+
 def exit_code(arguments: list[str]) -> Any:
     try:
         return cli.main(arguments)
@@ -109,6 +139,7 @@ def exit_code(arguments: list[str]) -> Any:
         (("table1", "--world", "libero"), "--model PATH"),
         (("fig4", "--world", "libero", "--model", "x"), "comvla-sim figure fading --world"),
         (("table1", "--episodes", "0"), "--episodes must be at least 1"),
+        (("table1", "--world", "libero", "--model", "x", "--suites", "y"), "choose among libero_sp"),
     ],
 )
 def test_nonsense_is_refused_before_anything_runs(

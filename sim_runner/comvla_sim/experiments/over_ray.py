@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import queue
 import socket
@@ -30,6 +31,9 @@ AUTO = "auto"
 
 REACH_TIMEOUT_S = 5.0
 JOIN_TIMEOUT_S = 45.0
+
+STORE_BYTES = 200_000_000
+"""Shared memory of a cluster of this machine's own: a row has some kilobytes."""
 
 RETRIES = 5
 """How often an episode starts again when its worker or node died under it."""
@@ -141,9 +145,10 @@ def _cluster(ray: Any, address: str, workers: int) -> Iterator[None]:
     if ray.is_initialized():  # the program that calls this has one
         yield
         return
-    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address == LOCAL:
         options |= {"num_cpus": workers or None, "include_dashboard": False}
+        options["object_store_memory"] = STORE_BYTES
     elif address != AUTO:
         _reach(address)
     _join(ray, address, options)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from comvla.number_arguments import whole
 from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.link_options import listed
 
 if TYPE_CHECKING:
     from comvla_sim.paper.results import Results
@@ -40,6 +41,7 @@ examples:
   comvla-sim paper table1 --ray head-node:6379
   comvla-sim paper all --docs docs
   comvla-sim paper all --world libero --model ./oft-{suite}
+  comvla-sim paper table1 --world libero --suites libero_spatial --model ./oft-spatial --target gpu:50051
 """
 
 QUICK_EPISODES = 2
@@ -47,12 +49,12 @@ QUICK_EPISODES = 2
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Registers the subcommand."""
-    listed = "\n".join(f"  {name:8}{what}" for name, what in PARTS.items())
+    known = "\n".join(f"  {name:8}{what}" for name, what in PARTS.items())
     parser = subparsers.add_parser(
         "paper",
         help="the paper's tables and figures, measured here beside its numbers",
         description=DESCRIPTION,
-        epilog=f"parts:\n{listed}\n\n{EPILOG}",
+        epilog=f"parts:\n{known}\n\n{EPILOG}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("part", choices=tuple(PARTS), help="see below")
@@ -67,6 +69,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--model",
         default="mini",
         help="mini, or a checkpoint folder; {suite} in it stands for each LIBERO suite (mini)",
+    )
+    parser.add_argument(
+        "--suites", type=listed(str), default=(), help="of LIBERO: libero_spatial,... (all four)"
+    )
+    parser.add_argument(
+        "--target", metavar="HOST:PORT", help="a server that runs the cloud half, e.g. on a GPU"
     )
     parser.add_argument("--seed", type=whole(), default=0, help="chooses the tables (0)")
     parser.add_argument("--workers", type=whole(), default=0, help="processes (one per core)")
@@ -102,6 +110,8 @@ def run(args: argparse.Namespace) -> int:
         out=args.out,
         workers=args.workers,
         ray=args.ray,
+        target=args.target,
+        only=args.suites,
         reuse=tuple(args.reuse) if args.reuse else gathering.default_reuse(),
         measured_only=args.measured_only,
     )

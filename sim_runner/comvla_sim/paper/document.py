@@ -95,7 +95,8 @@ def _story(results: Results) -> Part:
         "tables, not the training.",
         f"- Policy {settings['model']}, fingerprint `{settings['model_fingerprint']}`; INT8 tokens unless a line says "
         "otherwise; a link that loses nothing in the tables, fading in Figs. 4 and 5.",
-        f"- {wall_h:.1f} hours of one core of {machine['cpu']} ({machine['cores']} cores, shared with other work); "
+        f"- {wall_h:.1f} hours of wall time in episodes on {machine['cpu']} ({machine['cores']} cores, shared with "
+        "other work and halted at times); "
         "Python "
         f"{machine['python']}, "
         + ", ".join(f"{name} {number}" for name, number in versions.items())

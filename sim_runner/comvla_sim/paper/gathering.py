@@ -51,13 +51,14 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
     if any(GROUPS[name] for name in tables):
         measured, settings = measure_cells(plan, ordered(tables))
         data["cells"], data["pairs"] = all_counts(measured), all_pairs(measured)
-    if {"table1", "table2"} & set(tables):
+    inside = plan.target is None
+    if inside and {"table1", "table2"} & set(tables):
         data["latency"] = _kept_or(plan, "latency", lambda: _latency(study, data))
-    if "table1" in tables and plan.world != "libero":
+    if inside and "table1" in tables and plan.world != "libero":
         data["pictures"] = _kept_or(plan, "pictures", lambda: _pictures(plan, study, data))
-    if "table4" in tables:
+    if inside and "table4" in tables:
         data["layers"] = _kept_or(plan, "layers", lambda: _layers(study))
-    if "fig3" in parts:
+    if inside and "fig3" in parts:
         data["figure3"] = _kept_or(plan, "figure3", lambda: _figure3(plan, study))
     for part in (part for part in parts if part in SWEEP_OF):
         data[SWEEP_OF[part]] = _sweep(plan, study, part, quick=quick)

@@ -11,6 +11,8 @@ from typing import Any
 
 from comvla_sim.experiments import runner
 from comvla_sim.experiments.command import default_path
+from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.methods import find_method
 from comvla_sim.experiments.plan import EvalSettings, chosen_tasks
 from comvla_sim.experiments.results import Row
 from comvla_sim.experiments.statistics import mcnemar, wilson_interval
@@ -31,6 +33,9 @@ class Plan:
         out: folder of results and documents.
         workers: processes; 0 for one per core.
         ray: address of a Ray cluster, ``"local"``, or None for processes of this machine.
+        target: ``host:port`` of a running server, for models that are too large for this process; what only a server's
+            start decides (FastV) and what looks inside the model are then left out.
+        only: suites of LIBERO to run; empty for all.
         reuse: folders of other runs, whose episodes are taken over.
         measured_only: run nothing, and report what is there.
     """
@@ -42,12 +47,21 @@ class Plan:
     out: Path = Path("runs/paper")
     workers: int = 0
     ray: str | None = None
+    target: str | None = None
+    only: tuple[str, ...] = ()
     reuse: tuple[Path, ...] = ()
     measured_only: bool = False
 
     def suites(self) -> tuple[str, ...]:
         """Names of the columns: LIBERO's four suites, or the one world."""
-        return SUITES if self.world == "libero" else (self.world,)
+        if self.world != "libero":
+            return (self.world,)
+        for name in self.only:
+            if name not in SUITES:
+                raise EvaluationError(
+                    f"--suites {name!r} is unknown: choose among {', '.join(SUITES)}"
+                )
+        return tuple(suite for suite in SUITES if suite in (self.only or SUITES))
 
     def study(self, suite: str, quantization: str) -> Study:
         """What one suite's cells of one number format are measured on.
@@ -57,7 +71,7 @@ class Plan:
         """
         world = f"libero:{suite}" if self.world == "libero" else suite
         model = self.model.replace("{suite}", suite)
-        settings = EvalSettings(world, model, self.seed, quantization)
+        settings = EvalSettings(world, model, self.seed, quantization, self.target)
         subject = runner.inspect(settings)
         tasks = chosen_tasks(None, subject.tasks)
         return Study(
@@ -84,6 +98,8 @@ def measure_cells(
     found: Measured = {}
     studies: dict[tuple[str, str], Study] = {}
     for number, group in enumerate(groups, start=1):
+        if plan.target is not None:
+            group = tuple(cell for cell in group if not find_method(cell.method).server_option)
         for suite in plan.suites():
             for quantization in dict.fromkeys(cell.quantization for cell in group):
                 cells = [cell for cell in group if cell.quantization == quantization]
