@@ -15,7 +15,7 @@ from comvla_sim.experiments.layouts import evaluation_layout
 from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.policy import shown_model
 from comvla_sim.figures.measuring import Study
-from comvla_sim.paper.cells import GROUPS, PAPER_CELLS, Cell, ordered
+from comvla_sim.paper.cells import GROUPS, PAPER_CELLS, ordered
 from comvla_sim.paper.measuring import Plan, all_counts, all_pairs, measure_cells
 from comvla_sim.paper.published import TABLE_K
 from comvla_sim.paper.results import FORMAT, Json, Results, write
@@ -53,7 +53,7 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
         data["cells"], data["pairs"] = all_counts(measured), all_pairs(measured)
     inside = plan.target is None
     if inside and {"table1", "table2"} & set(tables):
-        data["latency"] = _kept_or(plan, "latency", lambda: _latency(study, data))
+        data["latency"] = _kept_or(plan, "latency", lambda: _latency(study))
     if inside and "table1" in tables and plan.world != "libero":
         data["pictures"] = _kept_or(plan, "pictures", lambda: _pictures(plan, study, data))
     if inside and "table4" in tables:
@@ -78,12 +78,11 @@ def _kept_or(plan: Plan, name: str, make: Any) -> Json:
     return made
 
 
-def _latency(study: Study, data: Json) -> Json:
+def _latency(study: Study) -> Json:
     from comvla_sim.paper.latency import measure_latency
 
-    measured = [Cell(c["method"], c["k"], c["quantization"]) for c in data["cells"]]
-    wanted = [*PAPER_CELLS, *(c for c in measured if c.quantization == "int8")]
-    return measure_latency(study, list(dict.fromkeys(wanted)))
+    cells = [*PAPER_CELLS, *(cell for group in GROUPS["table1"] for cell in group)]
+    return measure_latency(study, list(dict.fromkeys(cells)))
 
 
 def _pictures(plan: Plan, study: Study, data: Json) -> Json:
