@@ -44,6 +44,7 @@ def paper(out: Path, part: str, *options: str) -> int:
     return cli.main(["paper", part, *fixed, *options])
 
 
+@pytest.mark.slow
 def test_a_table_is_measured_resumed_and_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -80,6 +81,7 @@ def test_a_table_is_measured_resumed_and_written(
     assert (docs / "results.md").read_bytes() == (out / "results.md").read_bytes()
 
 
+@pytest.mark.slow
 def test_number_formats_share_what_is_measured_and_show_their_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +97,7 @@ def test_number_formats_share_what_is_measured_and_show_their_error(
     assert {"first", "second", "p_value"} <= set(printed["pairs"][0])
 
 
+@pytest.mark.slow
 def test_what_a_query_costs_is_measured_by_every_method(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -110,6 +113,7 @@ def test_what_a_query_costs_is_measured_by_every_method(
     assert random["pairs"] == 8
 
 
+@pytest.mark.slow
 def test_stale_reports_take_over_what_a_figure_has_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +169,7 @@ def test_pictures_show_what_is_kept_and_darken_the_rest() -> None:
     assert shown[4, 4].max() < 60
 
 
+@pytest.mark.slow
 def test_several_instructions_on_one_picture_and_a_film() -> None:
     from PIL import Image
 
