@@ -19,6 +19,7 @@ COMMANDS = {
     "train": "comvla_sim.training.command",
     "report": "comvla_sim.report.command",
     "figure": "comvla_sim.figures.command",
+    "paper": "comvla_sim.paper.command",
     "psnr": "comvla_sim.codecs.psnr_command",
     "bench": "comvla_sim.bench.command",
     "link": "comvla_sim.netlink.command",

@@ -13,7 +13,7 @@ from typing import Literal
 
 from comvla import codec
 from comvla.errors import LinkError
-from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
+from comvla.v1.policy_pb2 import GetModelResponse, ImageCoding, InferRequest, InferResponse
 from comvla_client import LinkProfile, SnrReading
 from comvla_client.errors import TransportError
 from comvla_client.streaming import PayloadStream, periods_of
@@ -28,6 +28,8 @@ UNENFORCED = "none"
 """The mode of a link that withholds nothing."""
 
 COUNTS = ("framed", "encoded")
+
+_ANALOGUE = (ImageCoding.IMAGE_CODING_DEEP_JSCC, ImageCoding.IMAGE_CODING_WITT)
 
 
 class EnforcedLink:
@@ -222,9 +224,7 @@ class EnforcedLink:
         self, request: InferRequest, timeout_s: float, window_s: float
     ) -> InferResponse:
         """Carries pictures whole or not at all: half a file shows nothing."""
-        offered_bytes = request.images.ByteSize()
-        if self._count == "framed":
-            offered_bytes = codec.wire_bytes(request.ByteSize()) + codec.CALL_HEADERS_BYTES
+        offered_bytes = self._pictures_cost_bytes(request)
         periods = self._patience_periods if self._mode == "queue" else self._span(window_s)
         asked = _Asked(self)
         carried_bytes = self._carry(offered_bytes, periods)
@@ -233,6 +233,23 @@ class EnforcedLink:
         if carried_bytes < offered_bytes:
             raise self._lost(asked, offered_bytes, carried_bytes, "no picture is of use in part")
         return self._transport.infer(request, timeout_s)
+
+    def _pictures_cost_bytes(self, request: InferRequest) -> int:
+        """Bytes on the radio for pictures. An analogue symbol is one use of the channel, W·T of which make a period: it
+        is charged as the bytes that would take as long at the SNR of the period, everything else as it is.
+        """
+        images = request.images
+        cost = images.ByteSize()
+        if self._count == "framed":
+            cost = codec.wire_bytes(request.ByteSize()) + codec.CALL_HEADERS_BYTES
+        if images.coding not in _ANALOGUE:
+            return cost
+        from comvla_vla.codecs.waveform import channel_uses
+
+        uses = sum(channel_uses(view.data) for view in images.views)
+        share = uses / (self._link.bandwidth_hz * self._link.period_s)
+        digital = cost - sum(len(view.data) for view in images.views)
+        return digital + int(share * self.capacity_bits / 8)
 
     def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
         """Carries a payload piece by piece until its window ends, and the answer back.

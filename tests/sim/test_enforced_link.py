@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import struct
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from comvla import codec
 from comvla.errors import LinkError
-from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
+from comvla.v1.policy_pb2 import GetModelResponse, ImageCoding, InferRequest, InferResponse
 from comvla_client import LinkProfile, TransportError, framed_token_budget
 from comvla_client.streaming import PayloadStream
 from comvla_sim.channel import ConstantChannel, RayleighChannel
@@ -269,3 +270,24 @@ def test_pictures_cross_whole_or_not_at_all(mode: Any, count: Any) -> None:
             assert not receiver.arrived
         assert radio.log[-1].offered_bytes == cost
         assert radio.log[-1].delivered_bytes == min(cost, room_bytes)
+
+
+@pytest.mark.parametrize("snr_db", [-5.0, 20.0])
+def test_analogue_symbols_are_charged_by_uses_of_the_channel(snr_db: float) -> None:
+    """However many bytes stand for them here: a symbol is one of W·T, at any SNR."""
+    profile = LinkProfile(bandwidth_hz=1e6, period_s=0.05)
+    symbols = 20_000  # of 50 000
+    header = struct.pack("<4sBBH8s3f", b"CVAS", 1, 4, 0, bytes(8), 1.0, 0.0, 0.1) + b"witt"
+    request = InferRequest(session_id="s")
+    request.images.coding = ImageCoding.IMAGE_CODING_WITT
+    request.images.views.add(data=header + bytes(8 * symbols), height=64, width=64)
+    link = EnforcedLink(Receiver(), itertools.repeat(snr_db), profile, mode="drop", count="encoded")
+    link.infer(request, 1.0)
+    share = symbols / (profile.bandwidth_hz * profile.period_s)
+    (record,) = link.log
+    spent = 8 * record.offered_bytes / record.capacity_bits
+    assert spent == pytest.approx(share, abs=0.02)
+    link.advance()
+    request.images.views.add(data=header + bytes(8 * 40_000), height=64, width=64)
+    with pytest.raises(TransportError, match="no picture is of use in part"):
+        link.infer(request, 1.0)

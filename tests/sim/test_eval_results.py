@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -133,3 +135,39 @@ def test_an_episode_counts_once(tmp_path: Path) -> None:
     rows, complete = read_rows(path)
     assert [row["success"] for row in rows] == [True]
     assert complete == path.stat().st_size
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits on file sizes")
+def test_a_full_disk_loses_no_row_and_leaves_no_half_one(tmp_path: Path) -> None:
+    """A limit on the size of files stands in for the disk; the process is another one, which can be limited."""
+    path = tmp_path / "results.jsonl"
+    rows = [made_up_row(episode=episode) for episode in range(4)]
+    room = sum(len(json.dumps(row)) + 1 for row in rows[:2]) + 100
+    program = f"""
+import json, resource, signal, sys
+from pathlib import Path
+from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.results import ResultsFile
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))
+rows = json.loads(sys.stdin.read())
+try:
+    with ResultsFile(Path({str(path)!r}), rows[0]["settings"]) as results:
+        for row in rows:
+            results.append(row)
+except EvaluationError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        input=json.dumps(rows),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "the 2 episodes before are kept: make room" in done.stdout
+    assert [json.loads(line) for line in path.read_text().splitlines()] == rows[:2]
+    with ResultsFile(path, SETTINGS) as results:  # once there is room
+        results.append(rows[2])
+    assert [row["episode"] for row in read_rows(path)[0]] == [0, 1, 2]

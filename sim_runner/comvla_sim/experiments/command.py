@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from comvla.number_arguments import whole
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.link_options import add_link_options, links_of, listed
-from comvla_sim.experiments.progress import cores, episode_bar, typed_command
+from comvla_sim.experiments.progress import Pace, cores, episode_bar, typed_command
 
 if TYPE_CHECKING:
     from comvla_sim.experiments.plan import EvalSettings
@@ -39,6 +39,7 @@ examples:
   comvla-sim eval --method hard_voting --k 16 --condition blind,wrong_instruction --json
   comvla-sim eval --method full,hard_voting,jpeg-75,h264-28 --k 32
   comvla-sim eval --method hard_voting --k 32 --target robot-cloud:50051
+  comvla-sim eval --method hard_voting,random --k 32 --ray head-node:6379
   comvla-sim eval --method hard_voting --channel rician --mean-snr-db 0,10 --enforce none,prefix
 """
 
@@ -77,6 +78,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--quantization", default="int8", help="of the tokens on the wire (int8)")
     parser.add_argument("--workers", type=whole(), default=0, help="processes (one per core)")
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="run over Ray: local, auto, or HOST:PORT of a cluster's head node",
+    )
     parser.add_argument("--target", metavar="HOST:PORT", help="a running server; else in process")
     parser.add_argument("--out", type=Path, help="results file (a name in runs/eval)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -118,10 +124,11 @@ def run(args: argparse.Namespace) -> int:
     grid.check(num_tokens=subject.num_tokens, seed=args.seed)
     _check_server_options(args.method, args.target)
     specs = list(grid.specs(subject.num_tokens))
-    path = args.out or _default_path(settings, subject)
+    path = args.out or default_path(settings, subject)
     with ResultsFile(path, subject.settings) as results:
         done = sum(spec in results.rows for spec in specs)
         print(f"{path}: {done} of {len(specs)} episodes are there", file=sys.stderr)
+        pace = Pace()
         try:
             with episode_bar(len(specs), done) as on_row:
                 runner.run(
@@ -131,14 +138,18 @@ def run(args: argparse.Namespace) -> int:
                     shared=subject.settings,
                     story=runner.environment(settings, typed_command()),
                     workers=args.workers or cores(),
-                    on_row=on_row,
+                    ray=args.ray,
+                    on_row=pace.counting(on_row),
                 )
         except KeyboardInterrupt:
             print(f"\nstopped; the same command goes on from {path}", file=sys.stderr)
             return 130
         summary = summarise(results.rows[spec] for spec in specs)
+    if pace.episodes:
+        print(pace, file=sys.stderr)
     if args.json:
-        print(json.dumps({"results": str(path), "settings": subject.settings, **summary}))
+        head = {"results": str(path), "settings": subject.settings, "pace": pace.to_dict()}
+        print(json.dumps({**head, **summary}))
     else:
         from comvla_sim.report.terminal import print_summary
 
@@ -168,7 +179,7 @@ def _tokens(text: str) -> int | None:
     return None if text == "link" else whole()(text)
 
 
-def _default_path(settings: EvalSettings, subject: Subject) -> Path:
+def default_path(settings: EvalSettings, subject: Subject) -> Path:
     """A name that changes with everything that must not be mixed in one file."""
     world = settings.world.replace(":", "-")
     model = f"{subject.settings['model']}-{subject.settings['model_fingerprint'][:8]}"

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO
 
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.plan import EpisodeSpec
@@ -99,7 +99,7 @@ class ResultsFile:
         self.path = path
         self.rows: dict[EpisodeSpec, Row] = {}
         self._settings = dict(settings)
-        self._file: TextIO | None = None
+        self._file: BinaryIO | None = None
         complete = 0
         if path.exists():
             rows, complete = read_rows(path)
@@ -108,7 +108,7 @@ class ResultsFile:
                 self.rows[spec_of(row)] = row
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = path.open("a", encoding="utf-8")
+            file = path.open("ab", buffering=0)
         except OSError as error:
             raise EvaluationError(f"cannot write {path}: {error.strerror}") from error
         if fcntl is not None:
@@ -135,11 +135,26 @@ class ResultsFile:
                 )
 
     def append(self, row: Row) -> None:
-        """Writes one row through to the file."""
+        """Writes one row through to the file.
+
+        Raises:
+            EvaluationError: the disk is full, or gone; the rows before are kept.
+        """
         if self._file is None:
             raise ValueError("the results file is closed")
-        self._file.write(json.dumps(row, allow_nan=False) + "\n")
-        self._file.flush()
+        line = (json.dumps(row, allow_nan=False) + "\n").encode()
+        number = self._file.fileno()
+        before = os.fstat(number).st_size
+        written = 0
+        try:
+            while written < len(line):
+                written += os.write(number, line[written:])
+        except OSError as error:
+            os.ftruncate(number, before)  # a row is there whole or not at all
+            raise EvaluationError(
+                f"cannot write to {self.path} ({error.strerror}); the {len(self.rows)} episodes "
+                "before are kept: make room, then run the same command again to go on"
+            ) from error
         self.rows[spec_of(row)] = row
 
     def close(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,6 @@ from comvla_sim.experiments.link_options import listed
 if TYPE_CHECKING:
     from comvla_sim.experiments.link_case import LinkCase
     from comvla_sim.figures.measuring import Study
-    from comvla_sim.figures.series import Series
 
 FIGURES = {
     "fading": """\
@@ -47,7 +46,7 @@ examples:
 """
 
 QUICK_EPISODES = 2
-_QUICK_SNR_DB, _QUICK_DELAYS = (0.0, 10.0, 20.0), (0, 2)
+QUICK_SNR_DB, QUICK_DELAYS = (0.0, 10.0, 20.0), (0, 2)
 
 BANDWIDTH_HZ, TOKEN_DIM = 0.18e6, 96
 """One LTE resource block, the carrier of NB-IoT, and the shipped policy's tokens: from 0 to 20 dB
@@ -92,13 +91,14 @@ def _add_options(parser: argparse.ArgumentParser, *, one: bool) -> None:
     parser.add_argument("--seed", type=whole(), default=0, help="chooses the tables (0)")
     if one:
         parser.add_argument("--episode", type=whole(), default=0, help="number of the table (0)")
-        parser.set_defaults(episodes=1, quick=False, workers=1)
+        parser.set_defaults(episodes=1, quick=False, workers=1, ray=None)
     else:
         parser.add_argument(
             "--episodes", type=whole(), default=20, help="tables per instruction (20)"
         )
         parser.add_argument("--quick", action="store_true", help="fewer points, 2 tables: minutes")
         parser.add_argument("--workers", type=whole(), default=0, help="processes (one per core)")
+        parser.add_argument("--ray", metavar="ADDRESS", help="as for comvla-sim eval")
     parser.add_argument("--out", type=Path, default=Path("runs/figure"), help="(runs/figure)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -117,6 +117,7 @@ def run(args: argparse.Namespace) -> int:
         QUICK_EPISODES if args.quick else args.episodes,
         args.out,
         args.workers,
+        args.ray,
     )
     study.check()
     if args.figure == "episode":
@@ -131,48 +132,29 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _bandwidth_hz(args: argparse.Namespace, study: Study) -> float:
-    if args.bandwidth_hz is not None:
-        return float(args.bandwidth_hz)
-    return float(f"{BANDWIDTH_HZ * study.subject.token_dim / TOKEN_DIM:.2g}")
+def figure_bandwidth_hz(token_dim: int) -> float:
+    """W of the figures for tokens of another width than the shipped policy's: to two digits, the same budgets."""
+    return float(f"{BANDWIDTH_HZ * token_dim / TOKEN_DIM:.2g}")
 
 
 def _sweep(args: argparse.Namespace, study: Study) -> dict[str, Any]:
-    from comvla_sim.figures import sweeps
-    from comvla_sim.figures.measuring import measure, specs
-    from comvla_sim.figures.points import points
+    from comvla_sim.figures.running import run_sweep
     from comvla_sim.figures.series import chosen
-    from comvla_sim.figures.tables import comparison_table, tables
+    from comvla_sim.figures.sweeps import SWEEPS
 
-    sweep = sweeps.SWEEPS[args.figure]
+    sweep = SWEEPS[args.figure]
     series = chosen(sweep.series if args.series is None else args.series)
-    links = _links(args, study, sweep)
-    rows = measure(args.figure, study, specs(study, series, links))
-    found = points(rows, series, links)
-    draw = sweeps.draw_fading if args.figure == "fading" else sweeps.draw_csi_delay
-    paths = draw(found, study, links[0], args.out)
-    printed = {
-        "figure": args.figure,
-        "files": [str(path) for path in paths],
-        "results": str(args.out / f"{args.figure}.jsonl"),
-        "caption": sweeps.caption(found, study, links[0]),
-        "settings": study.subject.settings,
-        "points": [point.to_dict() for point in found],
-        "comparisons": _comparisons(rows, series, links),
-    }
-    shown = [*tables(args.figure, found), comparison_table(printed["comparisons"])]
-    text = f"{printed['caption']}\n\n" + "\n".join(table.markdown() for table in shown)
-    paths += [args.out / f"{args.figure}.{suffix}" for suffix in ("json", "md")]
-    _write(paths[-2], json.dumps(printed, indent=1) + "\n")
-    _write(paths[-1], text)
+    printed, text = run_sweep(args.figure, study, series, _links(args, study, sweep))
     if not args.json:
         print(text)
-        print("\n".join(str(path) for path in paths))
+        print("\n".join(printed["files"]))
+        print("\n".join(str(args.out / f"{args.figure}.{suffix}") for suffix in ("json", "md")))
     return printed
 
 
 def _episode(args: argparse.Namespace, study: Study) -> dict[str, Any]:
     from comvla_sim.figures.episode import draw_episode, episode_caption, run_one, story_dict
+    from comvla_sim.figures.running import write_text
     from comvla_sim.figures.series import chosen
     from comvla_sim.figures.sweeps import EPISODE
 
@@ -188,16 +170,8 @@ def _episode(args: argparse.Namespace, study: Study) -> dict[str, Any]:
         found["lines"][name] = {"caption": episode_caption(story, study), **story_dict(story)}
         if not args.json:
             print(episode_caption(story, study), *paths, sep="\n")
-    _write(args.out / "episode.json", json.dumps(found, indent=1) + "\n")
+    write_text(args.out / "episode.json", json.dumps(found, indent=1) + "\n")
     return found
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise EvaluationError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _links(args: argparse.Namespace, study: Study, sweep: Any) -> list[LinkCase]:
@@ -215,30 +189,16 @@ def _links(args: argparse.Namespace, study: Study, sweep: Any) -> list[LinkCase]
             channel=channel,
             mean_snr_db=mean_snr_db,
             csi_delay=delay,
-            bandwidth_hz=_bandwidth_hz(args, study),
+            bandwidth_hz=figure_bandwidth_hz(study.subject.token_dim)
+            if args.bandwidth_hz is None
+            else args.bandwidth_hz,
             doppler_hz=args.doppler_hz,
             rician_k=args.rician_k,
         )
         for channel in values(args.channel, sweep.channels)
-        for mean_snr_db in values(args.mean_snr_db, sweep.mean_snr_db, _QUICK_SNR_DB)
-        for delay in values(args.csi_delay, sweep.csi_delay, _QUICK_DELAYS)
+        for mean_snr_db in values(args.mean_snr_db, sweep.mean_snr_db, QUICK_SNR_DB)
+        for delay in values(args.csi_delay, sweep.csi_delay, QUICK_DELAYS)
     ]
     for link in links:
         link.check()
     return links
-
-
-def _comparisons(
-    rows: Mapping[Any, Any], series: Mapping[str, Series], links: Sequence[LinkCase]
-) -> list[dict[str, Any]]:
-    """Every line against the first that is not ideal: link by link, and all links together."""
-    from comvla_sim.figures.points import pairs
-
-    names = [name for name, line in series.items() if not line.ideal]
-    found = []
-    for second in names[1:]:
-        for scope in (*([link] for link in links), links):
-            where = scope[0].to_dict() if len(scope) == 1 else None
-            test = pairs(rows, series[names[0]], series[second], scope)
-            found.append({"first": names[0], "second": second, "link": where, **test})
-    return found

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from comvla_sim.experiments import runner
 from comvla_sim.experiments.errors import EvaluationError
@@ -29,6 +28,8 @@ class Study:
         episodes: layouts for each task.
         out: folder of results and pictures.
         workers: processes; 0 for one per core.
+        ray: address of a Ray cluster; None for processes of this machine.
+        reuse: folders of other runs, whose episodes are taken over.
     """
 
     settings: EvalSettings
@@ -37,6 +38,8 @@ class Study:
     episodes: int
     out: Path
     workers: int
+    ray: str | None = None
+    reuse: tuple[Path, ...] = ()
 
     def check(self) -> None:
         """Refuses what cannot be run.
@@ -83,7 +86,9 @@ def measure(name: str, study: Study, wanted: Sequence[EpisodeSpec]) -> dict[Epis
     shared = study.subject.settings
     path = study.out / f"{name}.jsonl"
     with ResultsFile(path, shared) as results:
-        _take_over(path, wanted, results, shared)
+        missing = [spec for spec in wanted if spec not in results.rows]
+        for row in kept(name, study, missing, own=False).values():
+            results.append(row)
         done = sum(spec in results.rows for spec in wanted)
         print(f"{path}: {done} of {len(wanted)} episodes are there", file=sys.stderr)
         try:
@@ -95,6 +100,7 @@ def measure(name: str, study: Study, wanted: Sequence[EpisodeSpec]) -> dict[Epis
                     shared=shared,
                     story=runner.environment(study.settings, typed_command()),
                     workers=study.workers or cores(),
+                    ray=study.ray,
                     on_row=on_row,
                 )
         except KeyboardInterrupt:
@@ -103,15 +109,26 @@ def measure(name: str, study: Study, wanted: Sequence[EpisodeSpec]) -> dict[Epis
         return {spec: results.rows[spec] for spec in wanted}
 
 
-def _take_over(
-    path: Path, wanted: Sequence[EpisodeSpec], results: ResultsFile, shared: Mapping[str, Any]
-) -> None:
-    missing = {spec for spec in wanted if spec not in results.rows}
-    for other in sorted(path.parent.glob("*.jsonl")):
-        if other == path or not missing:
-            continue
-        for row in read_rows(other)[0]:
-            spec = EpisodeSpec.from_row(row)
-            if row["settings"] == shared and spec in missing:
-                results.append(row)
-                missing.discard(spec)
+def kept(
+    name: str, study: Study, wanted: Sequence[EpisodeSpec], *, own: bool = True
+) -> dict[EpisodeSpec, Row]:
+    """The rows that earlier runs have left behind, in the order in which they are wanted.
+
+    Args:
+        name: of the figure, and of its results file.
+        study: what is measured on.
+        wanted: episodes.
+        own: whether the file of that name is read, too.
+    """
+    path = study.out / f"{name}.jsonl"
+    missing, found = set(wanted), {}
+    for folder in dict.fromkeys((study.out, *study.reuse)):
+        for file in sorted(folder.glob("*.jsonl"), key=lambda file: file != path):
+            if (file == path and not own) or not missing:
+                continue
+            for row in read_rows(file)[0]:
+                spec = EpisodeSpec.from_row(row)
+                if row["settings"] == study.subject.settings and spec in missing:
+                    found[spec] = row
+                    missing.discard(spec)
+    return {spec: found[spec] for spec in wanted if spec in found}

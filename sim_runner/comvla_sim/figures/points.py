@@ -92,7 +92,7 @@ def _point(name: str, line: Series, link: LinkCase, rows: Sequence[Row]) -> Poin
         low=round(low, 6),
         high=round(high, 6),
         periods=round(sum(solved) / len(solved), 1) if solved else None,
-        bytes_per_query=round(sum(row["framed_bytes"] for row in rows) / queries, 1),
+        bytes_per_query=round(sum(row["framed_bytes"] for row in rows) / max(1, queries), 1),
         link_use=link_use(uses),
     )
 
@@ -122,5 +122,6 @@ def pairs(
             (bool(row["success"]), theirs[spec.task, spec.episode])
             for spec, row in rows.items()
             if (spec.method, spec.link) == (first.method, first.link(link))
+            and (spec.task, spec.episode) in theirs
         ]
     return vars(mcnemar([a for a, _ in outcomes], [b for _, b in outcomes]))

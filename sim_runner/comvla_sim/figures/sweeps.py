@@ -131,7 +131,8 @@ def caption(points: Sequence[Point], study: Study, link: LinkCase) -> str:
     names = {point.series for point in points}
     delays = sorted({point.axes["csi_delay"] for point in points})
     parts = [
-        f"{study.subject.settings['model']} in {study.settings.world}, {' to '.join(map(str, counts))} "
+        f"{study.subject.settings['model']} in {study.settings.world}, "
+        f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} "
         f"episodes per point ({study.episodes} tables for each of {len(study.tasks)} instructions), "
         f"evaluation seed {study.settings.seed}; Wilson's 95 % intervals.",
         f"Link of {link.bandwidth_hz / 1e6:g} MHz, T = {1000 * link.period_s:g} ms, "

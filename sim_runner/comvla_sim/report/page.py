@@ -27,7 +27,7 @@ class Section:
         title: heading.
         story: what was measured and how, one line each.
         commands: what to type to measure it again.
-        plots: (what it shows, SVG) pairs.
+        plots: (what it shows, SVG, PNG or WebP) pairs.
         tables: in reading order.
     """
 
@@ -66,12 +66,21 @@ def page(title: str, sections: Sequence[Section]) -> str:
 """
 
 
+def data_uri(picture: bytes) -> str:
+    """A picture (SVG, PNG or WebP) as an address that holds it."""
+    kind = "svg+xml"
+    if picture.startswith(b"\x89PNG"):
+        kind = "png"
+    elif picture[8:12] == b"WEBP":
+        kind = "webp"
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
+
+
 def _section(section: Section) -> str:
     story = "".join(f"<p>{escape(line)}</p>" for line in section.story)
     plots = "".join(
-        f'<img alt="{escape(name, quote=True)}" src="data:image/svg+xml;base64,'
-        f'{base64.b64encode(svg).decode()}">'
-        for name, svg in section.plots
+        f'<img alt="{escape(name, quote=True)}" src="{data_uri(picture)}">'
+        for name, picture in section.plots
     )
     tables = "".join(table.html() for table in section.tables)
     commands = escape("\n".join(section.commands))

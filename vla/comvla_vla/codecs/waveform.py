@@ -46,6 +46,12 @@ class Waveform:
     fingerprint: bytes
 
 
+def channel_uses(data: bytes) -> int:
+    """How often the channel is used for one picture that :func:`write_waveform` wrote: once for each symbol."""
+    _, _, name_length, *_ = _HEADER.unpack_from(data)
+    return int((len(data) - _HEADER.size - name_length) // np.dtype(np.complex64).itemsize)
+
+
 def write_waveform(
     symbols: npt.NDArray[np.complex64], gain: complex, noise: float, trained: TrainedCodec
 ) -> bytes:
