@@ -85,6 +85,7 @@ def add_page(app: FastAPI, fleet: Fleet, feed: FleetFeed) -> None:
         "/events",
         summary="What happens in the fleet, as server-sent events",
         response_class=EventStream,
+        status_code=200,  # the class does not say, and the description of the API asks
         responses={503: {"description": "as many pages watch as may"}},
     )
     async def events(request: Request) -> Response:
