@@ -55,7 +55,7 @@ def mutated_pictures(rng: random.Random) -> bytes:
     request = plain_request(rng)
     request.ClearField("payload")
     coding = rng.choice(CODINGS)
-    request.images.coding = coding_number(coding)  # type: ignore[assignment]
+    request.images.coding = coding_number(coding)
     for data in _files(coding, rng.randrange(8)):
         rows, columns = INFO.image_size
         request.images.views.add(data=data, height=rows, width=columns)

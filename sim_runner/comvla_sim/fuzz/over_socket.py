@@ -7,6 +7,7 @@ import contextlib
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
+from typing import Any
 
 import grpc
 
@@ -81,8 +82,8 @@ class _Caller:
     """Sends bytes as messages, whatever they are."""
 
     def __init__(self, channel: grpc.aio.Channel, tally: Tally) -> None:
-        self._infer = channel.unary_unary(f"{_SERVICE}/Infer")
-        self._stream = channel.stream_unary(f"{_SERVICE}/InferProgressive")
+        self._infer: Any = channel.unary_unary(f"{_SERVICE}/Infer")
+        self._stream: Any = channel.stream_unary(f"{_SERVICE}/InferProgressive")
         self._tally = tally
 
     async def run(self, case: Case) -> None:
