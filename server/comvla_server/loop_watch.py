@@ -12,6 +12,7 @@ _MEMORY = 0.7  # of the last value at each tick: half of it is forgotten after 0
 _BUSY = 0.5
 _LATE_S = 0.005
 _DEATHS = 0.02
+_LEAST_CALLS = 5  # in one look: 100 a second, far below what a loop can read
 _LEAST_LOOKED_AT = 0.05
 
 
@@ -23,6 +24,7 @@ class LoopWatch:
 
     Where calls then die on their way through the server, it takes on more than it can do, whatever the model could:
     fewer of them are looked at, a fifth fewer at each look, until the others live; then slowly more again.
+    Where few calls come, it is not they who keep the loop from its work, and all are looked at.
 
     Args:
         clock: monotonic seconds.
@@ -79,7 +81,8 @@ class LoopWatch:
             self.busy += (1.0 - _MEMORY) * (busy - self.busy)
             self.late_s += (1.0 - _MEMORY) * (late_s - self.late_s)
         self._last = now_s, worked_s
-        if self.congested and self._died > _DEATHS * (self._died + self._lived):
+        calls = self._died + self._lived
+        if self.congested and calls >= _LEAST_CALLS and self._died > _DEATHS * calls:
             self.looked_at = max(_LEAST_LOOKED_AT, 0.8 * self.looked_at)
         else:
             self.looked_at = min(1.0, self.looked_at + 0.02)

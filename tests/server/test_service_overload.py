@@ -162,7 +162,8 @@ def test_a_congested_loop_looks_at_fewer_calls_until_the_others_live() -> None:
     assert watch.looked_at == 1.0
     assert not watch.skips()
     for _ in range(5):
-        watch.note(died=True)
+        for _ in range(10):
+            watch.note(died=True)
         looks(watch, times, 1, busy=0.95)
     assert watch.looked_at == pytest.approx(0.8**5)
     assert watch.skips()
@@ -178,6 +179,16 @@ def test_calls_that_die_while_the_loop_has_time_are_their_own_affair() -> None:
     times = Times()
     watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
     for _ in range(20):
-        watch.note(died=True)
+        for _ in range(10):
+            watch.note(died=True)
         looks(watch, times, 1, busy=0.2)
+    assert watch.looked_at == 1.0
+
+
+def test_a_few_robots_are_looked_at_however_slow_the_machine_is() -> None:
+    times = Times()
+    watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
+    for _ in range(20):
+        watch.note(died=True)
+        looks(watch, times, 1, busy=0.3, late_s=0.2)
     assert watch.looked_at == 1.0
