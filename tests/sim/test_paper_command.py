@@ -143,7 +143,10 @@ def exit_code(arguments: list[str]) -> Any:
         (("table1", "--world", "libero"), "--model PATH"),
         (("fig4", "--world", "libero", "--model", "x"), "comvla-sim figure fading --world"),
         (("table1", "--episodes", "0"), "--episodes must be at least 1"),
-        (("table1", "--world", "libero", "--model", "x", "--suites", "y"), "choose among libero_sp"),
+        (
+            ("table1", "--world", "libero", "--model", "x", "--suites", "y"),
+            "choose among libero_sp",
+        ),
     ],
 )
 def test_nonsense_is_refused_before_anything_runs(
