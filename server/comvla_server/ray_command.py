@@ -9,6 +9,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from typing import Any
 
 from comvla.errors import ComVLAError, DependencyError
@@ -47,6 +48,8 @@ _DEFAULTS = {
     "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
 }
 _OBJECT_STORE_BYTES = 100 * 2**20
+_PROXY_WITHIN_S = 60.0
+_LOOK_EVERY_S = 0.1
 _ELSEWHERE = ("tls_certificate", "tls_key", "tls_client_ca", "admin_tokens_file")
 
 
@@ -194,7 +197,32 @@ def _deploy(
     )
     # Ports and TLS are the proxy's: a replica listens nowhere.
     inner = dataclasses.replace(settings, host="127.0.0.1", insecure=False)
-    serve.run(deployment.bind(inner), name=APPLICATION, route_prefix=None)
+    # Without a prefix, which only HTTP needs, Ray's proxies would not hear of the application.
+    serve.run(deployment.bind(inner), name=APPLICATION, route_prefix=f"/{APPLICATION}")
+    _wait_for_proxy(settings.port)
+
+
+def _wait_for_proxy(port: int) -> None:
+    """Returns when the proxy hands calls on: it hears of an application a moment after it runs.
+
+    Raises:
+        grpc.RpcError: it did not in time.
+    """
+    import grpc
+    from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+    deadline = time.monotonic() + _PROXY_WITHIN_S
+    with grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.enable_http_proxy", 0)]) as channel:
+        ask: Any = health_pb2_grpc.HealthStub(channel).Check  # type: ignore[attr-defined]
+        while True:
+            try:
+                ask(health_pb2.HealthCheckRequest(), timeout=_PROXY_WITHIN_S, wait_for_ready=True)
+            except grpc.RpcError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(_LOOK_EVERY_S)
+            else:
+                return
 
 
 def _ray() -> Any:
