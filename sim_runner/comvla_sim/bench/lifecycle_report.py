@@ -38,7 +38,10 @@ def _kills(result: Mapping[str, Any]) -> list[str]:
             f"{result['recovery_periods_worst']:.2f} control periods of {result['period_s']:g} s; within 2 "
             f"in {result['recovered_within_2_periods']} of {len(result['outages'])}"
         )
-        lines.append(f"the server was down for {result['down_s_median']:.2f} s (median)")
+        lines.append(
+            f"the server was down for {result['down_s_median']:.2f} s (median); {result['kills_in_motion']} of "
+            f"{len(result['outages'])} kills fell while the task was under way"
+        )
     return lines + [f"exception: {text}" for text in result["exceptions"]]
 
 
