@@ -10,6 +10,7 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from comvla.errors import ComVLAError, DependencyError
@@ -91,15 +92,18 @@ def run(args: argparse.Namespace) -> int:
     _check(settings)
     logs.configure(settings.log_format, settings.log_level)
     stop = threading.Event()
-    _stop_on_signals(stop)
-    with deployed(
-        settings,
-        replicas=args.replicas,
-        address=args.address,
-        num_cpus=args.num_cpus,
-        num_gpus=args.num_gpus,
-    ) as target:
-        _stop_on_signals(stop)  # Ray has put handlers of its own there
+    _on_signals(_interrupt)  # Ray takes a while to start
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        deployed(
+            settings,
+            replicas=args.replicas,
+            address=args.address,
+            num_cpus=args.num_cpus,
+            num_gpus=args.num_gpus,
+        ) as target,
+    ):
+        _on_signals(lambda *_: stop.set())  # Ray has put handlers of its own there
         names = ",".join(name or source for name, source in settings.models.items())
         print(
             f"comvla-server ready grpc={target} model={names} replicas={args.replicas}", flush=True
@@ -108,9 +112,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _stop_on_signals(stop: threading.Event) -> None:
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _on_signals(handler: Callable[..., None]) -> None:
     for one in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(one, lambda *_: stop.set())
+        signal.signal(one, handler)
 
 
 @contextlib.contextmanager
