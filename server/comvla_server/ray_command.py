@@ -247,7 +247,7 @@ def _ray() -> Any:
 
 
 def _free_port() -> int:
-    """For the HTTP proxy that Ray starts whether it is wanted or not; nothing is routed through it."""
+    """For the HTTP proxy that Ray starts, wanted or not, on this machine only; replicas answer it nothing."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         return int(free.getsockname()[1])
 
