@@ -267,8 +267,8 @@ class _Loop:
             try:
                 return call.result(max(0.0, next_s)), passed
             except FutureTimeoutError:
-                if call.done():  # the client's own error
-                    raise
+                if call.done():  # just now, or with the client's own error
+                    return call.result(), passed
                 passed += 1
                 if not self.episode.success:
                     self._execute(self._client.hold_action[None], answered=False)
