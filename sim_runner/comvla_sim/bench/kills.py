@@ -316,7 +316,9 @@ class _Loop:
 def _result(
     parameters: KillParameters, undisturbed: _Run, disturbed: _Run, period_s: float
 ) -> dict[str, Any]:
-    recoveries = [outage.recovery_s for outage in disturbed.outages]
+    # One that an exception cut short has no recovery, and counts as none within any time.
+    over = [outage for outage in disturbed.outages if outage.down_s > 0.0]
+    recoveries = [outage.recovery_s for outage in over]
     rates = []
     rows = []
     for name, one in (("undisturbed", undisturbed), ("with kills", disturbed)):
@@ -353,9 +355,7 @@ def _result(
         "recovery_periods_median": float(np.median(recoveries)) / period_s if recoveries else None,
         "recovery_periods_worst": max(recoveries) / period_s if recoveries else None,
         "recovered_within_2_periods": sum(r <= ALLOWED_PERIODS * period_s for r in recoveries),
-        "down_s_median": float(np.median([o.down_s for o in disturbed.outages]))
-        if recoveries
-        else None,
+        "down_s_median": float(np.median([o.down_s for o in over])) if recoveries else None,
         # The others fell when the task was done already: the robot went on asking, the world stood still.
         "kills_in_motion": sum(outage.held_periods > 0 for outage in disturbed.outages),
         "outages": [asdict(outage) for outage in disturbed.outages],

@@ -32,7 +32,7 @@ def _kills(result: Mapping[str, Any]) -> list[str]:
         f"{result['only_undisturbed']}, only with kills {result['only_with_kills']}, "
         f"p = {result['p_value']:.2f})"
     ]
-    if result["outages"]:
+    if result["recovery_periods_worst"] is not None:
         lines.append(
             f"recovery after the server was back: median {result['recovery_periods_median']:.2f}, worst "
             f"{result['recovery_periods_worst']:.2f} control periods of {result['period_s']:g} s; within 2 "
