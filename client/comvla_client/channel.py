@@ -72,7 +72,8 @@ class Attempts:
     """
 
     FIRST_PAUSE_S = 0.005
-    LONGEST_PAUSE_S = 0.05
+    # A robot's control period is 50 ms: a server that comes back is found within half of one.
+    LONGEST_PAUSE_S = 0.02
 
     def __init__(self, timeout_s: float) -> None:
         self._deadline = time.monotonic() + timeout_s

@@ -65,6 +65,13 @@ class LoopWatch:
         """Whether the next call is one of those that are not looked at."""
         return self.looked_at < 1.0 and self._draw() >= self.looked_at
 
+    def forget(self) -> None:
+        """Begins anew: what was seen before anybody was served says nothing of the time after it."""
+        self._last = None
+        self._lived = self._died = 0
+        self.busy = self.late_s = 0.0
+        self.looked_at = 1.0
+
     async def run(self) -> None:
         """Looks until it is cancelled; on the loop that is watched."""
         while True:

@@ -9,6 +9,8 @@ import os
 import signal
 import socket
 import threading
+import time
+from collections.abc import Callable
 from typing import Any
 
 from comvla.errors import ComVLAError, DependencyError
@@ -47,6 +49,8 @@ _DEFAULTS = {
     "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
 }
 _OBJECT_STORE_BYTES = 100 * 2**20
+_PROXY_WITHIN_S = 60.0
+_LOOK_EVERY_S = 0.1
 _ELSEWHERE = ("tls_certificate", "tls_key", "tls_client_ca", "admin_tokens_file")
 
 
@@ -88,15 +92,18 @@ def run(args: argparse.Namespace) -> int:
     _check(settings)
     logs.configure(settings.log_format, settings.log_level)
     stop = threading.Event()
-    _stop_on_signals(stop)
-    with deployed(
-        settings,
-        replicas=args.replicas,
-        address=args.address,
-        num_cpus=args.num_cpus,
-        num_gpus=args.num_gpus,
-    ) as target:
-        _stop_on_signals(stop)  # Ray has put handlers of its own there
+    _on_signals(_interrupt)  # Ray takes a while to start
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        deployed(
+            settings,
+            replicas=args.replicas,
+            address=args.address,
+            num_cpus=args.num_cpus,
+            num_gpus=args.num_gpus,
+        ) as target,
+    ):
+        _on_signals(lambda *_: stop.set())  # Ray has put handlers of its own there
         names = ",".join(name or source for name, source in settings.models.items())
         print(
             f"comvla-server ready grpc={target} model={names} replicas={args.replicas}", flush=True
@@ -105,9 +112,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _stop_on_signals(stop: threading.Event) -> None:
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _on_signals(handler: Callable[..., None]) -> None:
     for one in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(one, lambda *_: stop.set())
+        signal.signal(one, handler)
 
 
 @contextlib.contextmanager
@@ -194,7 +205,32 @@ def _deploy(
     )
     # Ports and TLS are the proxy's: a replica listens nowhere.
     inner = dataclasses.replace(settings, host="127.0.0.1", insecure=False)
-    serve.run(deployment.bind(inner), name=APPLICATION, route_prefix=None)
+    # Without a prefix, which only HTTP needs, Ray's proxies would not hear of the application.
+    serve.run(deployment.bind(inner), name=APPLICATION, route_prefix=f"/{APPLICATION}")
+    _wait_for_proxy(settings.port)
+
+
+def _wait_for_proxy(port: int) -> None:
+    """Returns when the proxy hands calls on: it hears of an application a moment after it runs.
+
+    Raises:
+        grpc.RpcError: it did not in time.
+    """
+    import grpc
+    from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+    deadline = time.monotonic() + _PROXY_WITHIN_S
+    with grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.enable_http_proxy", 0)]) as channel:
+        ask: Any = health_pb2_grpc.HealthStub(channel).Check  # type: ignore[attr-defined]
+        while True:
+            try:
+                ask(health_pb2.HealthCheckRequest(), timeout=_PROXY_WITHIN_S, wait_for_ready=True)
+            except grpc.RpcError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(_LOOK_EVERY_S)
+            else:
+                return
 
 
 def _ray() -> Any:
@@ -211,7 +247,7 @@ def _ray() -> Any:
 
 
 def _free_port() -> int:
-    """For the HTTP proxy that Ray starts whether it is wanted or not; nothing is routed through it."""
+    """For the HTTP proxy that Ray starts, wanted or not, on this machine only; replicas answer it nothing."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         return int(free.getsockname()[1])
 

@@ -84,13 +84,13 @@ async def _serve(settings: ServerSettings, loads: Mapping[str, Callable[[], Engi
         await asyncio.wait({ready, stopping}, return_when=asyncio.FIRST_COMPLETED)
         if ready.done():
             info = ready.result()
+            _refresh_on_hangup(server)  # before anybody is told that it is ready: SIGHUP would kill
             names = "".join(f" serves={name}" for name in settings.models if name)
             print(
                 f"comvla-server ready grpc={server.target} admin={server.admin_url} "
                 f"model={info.name}{names}",
                 flush=True,
             )
-            _refresh_on_hangup(server)
             await asyncio.wait({stopping, lost}, return_when=asyncio.FIRST_COMPLETED)
     finally:
         ready.cancel()

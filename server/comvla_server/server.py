@@ -192,6 +192,8 @@ class Server:
         )
         if before is not None:
             before()
+        # Loading kept the loop from its work; the first robot must not be turned away for that.
+        self._service.loop_watch.forget()
         self.lifecycle.enter(Phase.SERVING)
         await self._health.serving()
         _log.info("serving %s", info.name, extra={"grpc": self.target})

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,8 @@ from comvla_vla import random_policy, save_policy
 from comvla_vla.random import unit_statistics
 
 TOKEN = "cvt_robot"
+START_WITHIN_S = 240.0
+STOP_WITHIN_S = 60.0
 needs_ray = pytest.mark.skipif(
     importlib.util.find_spec("ray") is None,
     reason="Ray is not installed: pip install 'comvla[ray]'",
@@ -73,15 +78,24 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
     )
+    # Ray waits long for its own processes on a busy machine; not longer than this.
+    watchdog = threading.Timer(START_WITHIN_S, process.terminate)
+    watchdog.start()
     try:
         assert process.stdout is not None
         line = next((x for x in process.stdout if x.startswith("comvla-server ready")), "")
-        assert f"grpc=127.0.0.1:{port} " in line
+        watchdog.cancel()
+        assert f"grpc=127.0.0.1:{port} " in line, f"not ready within {START_WITHIN_S:g} s"
         assert line.endswith("replicas=2\n")
         yield f"127.0.0.1:{port}"
     finally:
+        watchdog.cancel()
         process.terminate()
-        assert process.wait(PATIENCE_S) == 0
+        try:
+            assert process.wait(STOP_WITHIN_S) == 0
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 @needs_ray

@@ -155,6 +155,22 @@ def test_a_loop_is_congested_where_it_works_all_the_time_or_comes_late() -> None
     assert watch.congested
 
 
+def test_what_a_loop_missed_while_a_model_was_loaded_is_forgotten() -> None:
+    times = Times()
+    watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
+    looks(watch, times, 20, busy=0.95)
+    watch.note(died=True)
+    looks(watch, times, 1, busy=0.95, late_s=0.3)
+    assert watch.congested
+    assert watch.looked_at < 1.0
+    times.now_s += 0.3  # the last thing before robots are answered, which the loop has not seen yet
+    watch.forget()
+    assert watch.looked_at == 1.0
+    assert not watch.congested
+    looks(watch, times, 3, busy=0.2)
+    assert not watch.congested
+
+
 def test_a_congested_loop_looks_at_fewer_calls_until_the_others_live() -> None:
     times, drawn = Times(), [0.5]
     watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s, lambda: drawn[0])

@@ -32,13 +32,16 @@ def _kills(result: Mapping[str, Any]) -> list[str]:
         f"{result['only_undisturbed']}, only with kills {result['only_with_kills']}, "
         f"p = {result['p_value']:.2f})"
     ]
-    if result["outages"]:
+    if result["recovery_periods_worst"] is not None:
         lines.append(
             f"recovery after the server was back: median {result['recovery_periods_median']:.2f}, worst "
             f"{result['recovery_periods_worst']:.2f} control periods of {result['period_s']:g} s; within 2 "
             f"in {result['recovered_within_2_periods']} of {len(result['outages'])}"
         )
-        lines.append(f"the server was down for {result['down_s_median']:.2f} s (median)")
+        lines.append(
+            f"the server was down for {result['down_s_median']:.2f} s (median); {result['kills_in_motion']} of "
+            f"{len(result['outages'])} kills fell while the task was under way"
+        )
     return lines + [f"exception: {text}" for text in result["exceptions"]]
 
 

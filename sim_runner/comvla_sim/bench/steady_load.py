@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import uuid
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -116,13 +117,13 @@ def under_load(target: str, **options: Any) -> Iterator[Load]:
 def make_request(
     info: ModelInfo, number: int, token_budget: int, seed: int
 ) -> policy_pb2.InferRequest:
-    """Random tokens of one robot."""
+    """Random tokens of one robot, which nobody was before: steps of a session only count up."""
     rng = np.random.default_rng((seed, number))
     k = min(token_budget, info.num_tokens)
     tokens = rng.standard_normal((k, info.token_dim), np.float32)
     positions = rng.permutation(info.num_tokens)[:k]
     return policy_pb2.InferRequest(
-        session_id=f"robot-{number}",
+        session_id=f"robot-{number}-{uuid.uuid4().hex[:8]}",
         step=0,
         instruction=_INSTRUCTION,
         proprio=[0.0] * info.proprio_dim,
