@@ -19,7 +19,7 @@ import grpc
 from comvla.errors import ComVLAError
 from comvla.v1 import policy_pb2_grpc
 from comvla_sim.bench import environment
-from comvla_sim.bench.processes import connected
+from comvla_sim.bench.processes import ProcessError, connected
 from comvla_sim.fuzz import connections, over_socket
 from comvla_sim.fuzz.cases import DESCRIPTIONS, Case
 from comvla_sim.fuzz.in_process import Share, run_one, work, wrong_with
@@ -76,7 +76,10 @@ def run(
     else:
         progress = _Progress(parameters.requests, on_progress)
         watches += _in_process(parameters, tally, progress)
-        watches += _over_socket(parameters, tally, progress)
+        try:
+            watches += _over_socket(parameters, tally, progress)
+        except ProcessError as error:  # what was counted before stays
+            tally.fail("over sockets", "server", f"did not start: {error}")
     memory = [watch.verdict() for watch in watches]
     counts = tally.to_dict()
     return {
