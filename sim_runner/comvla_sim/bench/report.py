@@ -87,6 +87,8 @@ _HEADS = {
 
 def describe(result: Mapping[str, Any]) -> str:
     """The rows as a table, with where and how often they were measured."""
+    if not result["rows"]:  # its time was over before anything began
+        return "\n".join([_heading(result), *_conclusions(result)])
     columns = [name for name in _HEADS if name in result["rows"][0]]
     table = render(
         [_HEADS[name] for name in columns],

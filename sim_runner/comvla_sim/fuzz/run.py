@@ -97,7 +97,9 @@ def run(
         "known_ends": counts["statuses"].get("frames", {}).get(connections.KNOWN_END, 0),
         "grpcio": grpc.__version__,
         "memory": memory,
-        "passed": not tally.failed and not any(item["grew"] for item in memory),
+        "passed": bool(tally.kinds)
+        and not tally.failed
+        and not any(item["grew"] for item in memory),
     }
 
 
