@@ -11,24 +11,28 @@ import grpc
 _log = logging.getLogger(__name__)
 
 
-async def start_watched(server: grpc.aio.Server, on_end: Callable[[], None]) -> None:
+async def start_watched(server: grpc.aio.Server, on_end: Callable[[BaseException], None]) -> None:
     """Starts a server, and tells when its loop ends by an error.
 
-    The loop in which grpc.aio takes calls (grpcio 1.85) ends for good when the path of a request is no
-    UTF-8: before any interceptor, and before anybody is asked for a token. The port is closed then, while
-    the process looks well. A second server in the same process was tried, and crashed it; so the process
-    says that it is ill, and whoever watches over it starts it again.
+    From grpcio 1.84 on, the loop in which grpc.aio takes calls ends for good when the path of a request
+    is no UTF-8: before any interceptor, and before anybody is asked for a token. The project asks for an
+    earlier one; this is for whoever has a later one all the same, and for what else may end that loop.
+    The port is closed then, while the process looks well. A second server in the same process was tried,
+    and crashed it; so the process says that it is ill, and whoever watches over it starts it again.
 
     Args:
         server: bound, not started.
-        on_end: called once, on the event loop.
+        on_end: called once, on the event loop, with what ended it.
     """
 
     def ended(task: asyncio.Task[object]) -> None:
-        if task.cancelled() or task.exception() is None:
+        if task.cancelled():
             return
-        _log.critical("gRPC stopped taking calls: %s", ascii(task.exception())[:200])
-        on_end()
+        error = task.exception()
+        if error is None:
+            return
+        _log.critical("gRPC stopped taking calls: %s", ascii(error)[:200])
+        on_end(error)
 
     before = asyncio.all_tasks()
     await server.start()

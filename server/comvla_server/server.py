@@ -56,6 +56,7 @@ class Server:
         port: gRPC port, known after :meth:`bind`.
         admin_port: HTTP port, known after :meth:`bind`.
         port_lost: set when gRPC has stopped taking calls by itself: the process should end.
+        port_lost_by: what gRPC raised then.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class Server:
         self.port = 0
         self.admin_port = 0
         self.port_lost = asyncio.Event()
+        self.port_lost_by: BaseException | None = None
         self._sources = dict(engine) if isinstance(engine, Mapping) else {UNNAMED: engine}
         self._checkpoints = dict(sources or {})
         self._loader = loader or CheckpointLoader(self.settings)
@@ -199,8 +201,9 @@ class Server:
         _log.info("serving %s", info.name, extra={"grpc": self.target})
         return info
 
-    def _lose_port(self) -> None:
+    def _lose_port(self, error: BaseException) -> None:
         """Robots are not answered any more, and will not be: /healthz and /readyz say so."""
+        self.port_lost_by = error
         self.lifecycle.enter(Phase.STOPPED)
         self.port_lost.set()
 
@@ -232,9 +235,11 @@ class Server:
         if self._tracing is not None:
             await asyncio.to_thread(self._tracing.close)
         if self._grpc is not None:
-            # A server whose loop has ended raises what ended it.
-            with contextlib.suppress(UnicodeDecodeError):
+            try:
                 await self._grpc.stop(_FLUSH_S)
+            except Exception as error:  # a server whose loop has ended raises what ended it
+                if error is not self.port_lost_by:
+                    raise
         if self._feed is not None:
             await self._feed.close()
         if self._admin is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -23,6 +24,7 @@ from server_stubs import PATIENCE_S, Robot, StubCloud, eventually, message
 
 from comvla_server import cli, serve_command
 from comvla_server.engine import Engine
+from comvla_server.server import Server
 from comvla_vla import random_policy, save_policy
 from comvla_vla.random import unit_statistics
 
@@ -199,6 +201,33 @@ def test_a_signal_while_the_model_loads_ends_the_process(
     stdout, stderr = capsys.readouterr()
     assert "ready" not in stdout
     assert "Traceback" not in stderr
+
+
+@pytest.mark.usefixtures("logging_as_it_was")
+def test_a_server_that_grpc_has_left_ends_with_code_1(
+    monkeypatch: pytest.MonkeyPatch, cloud: StubCloud
+) -> None:
+    """Whoever watches over it, compose or Kubernetes, starts it again then."""
+    servers: list[Server] = []
+    loops: list[asyncio.AbstractEventLoop] = []
+
+    class Remembered(Server):
+        async def bind(self) -> None:
+            servers.append(self)
+            loops.append(asyncio.get_running_loop())
+            await super().bind()
+
+    monkeypatch.setattr("comvla_server.server.Server", Remembered)
+    monkeypatch.setattr(serve_command, "load_engine", lambda *_: Engine(cloud))
+
+    def lose() -> None:
+        eventually(lambda: bool(servers) and servers[0].lifecycle.ready)
+        loops[0].call_soon_threadsafe(servers[0]._lose_port, RuntimeError("no more calls"))
+
+    with ThreadPoolExecutor(1) as pool:
+        losing = pool.submit(lose)
+        assert cli.main(["serve", *FREE_PORTS]) == 1
+        losing.result()
 
 
 def findings(target: str) -> list[dict[str, Any]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import itertools
 import socket
 import ssl
@@ -22,6 +24,7 @@ from comvla_server import admin_http
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.grpc_adapter import SERVICE_NAME
+from comvla_server.grpc_port import start_watched
 from comvla_server.identity import Identity
 from comvla_server.settings import ServerSettings
 from comvla_server.tokens import TokenLine, new_token
@@ -348,15 +351,65 @@ def test_old_tls_is_refused(cloud: StubCloud, tls_files: dict[str, Path]) -> Non
                 context.wrap_socket(plain)
 
 
+# Outside what pyproject.toml asks for, from here on; see SECURITY.md.
+LOOP_ENDS = tuple(map(int, grpc.__version__.split(".")[:2])) >= (1, 84)
+
+
+@contextlib.contextmanager
+def path_that_is_no_text(port: int) -> Iterator[socket.socket]:
+    """A stranger's connection that has asked for a path which is no UTF-8."""
+    names = (":method", "POST"), (":scheme", "http"), ("te", "trailers"), (":authority", "x")
+    block = b"".join(itertools.starmap(header, names)) + b"\x00\x05:path\x03/a\xf4"
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as stranger:
+        stranger.sendall(PREFACE + frame(SETTINGS, 0, 0, b""))
+        stranger.sendall(frame(HEADERS, END_HEADERS | END_STREAM, 1, block))
+        yield stranger
+
+
+@pytest.mark.skipif(LOOP_ENDS, reason="this grpcio is later than those the project asks for")
+def test_a_path_that_is_no_text_is_refused_and_nothing_else(server: BackgroundServer) -> None:
+    with Robot(server.target) as robot:
+        for _ in range(3):
+            with path_that_is_no_text(server.server.port) as stranger:
+                answer = b""
+                while b"grpc-status" not in answer:
+                    part = stranger.recv(4096)
+                    assert part, f"closed after {answer!r}"
+                    answer += part
+            robot.infer(message())
+    assert httpx.get(f"{server.admin_url}/healthz").status_code == 200
+
+
+@pytest.mark.skipif(not LOOP_ENDS, reason="nothing is known that ends the loop of this grpcio")
 def test_a_server_whose_port_a_stranger_closed_asks_to_be_restarted(
     server: BackgroundServer,
 ) -> None:
-    """A path that is no UTF-8 ends the loop in which grpc.aio takes calls, whoever sends it."""
-    names = (":method", "POST"), (":scheme", "http"), ("te", "trailers"), (":authority", "x")
-    block = b"".join(itertools.starmap(header, names)) + b"\x00\x05:path\x03/a\xf4"
-    with socket.create_connection(("127.0.0.1", server.server.port)) as stranger:
-        stranger.sendall(PREFACE + frame(SETTINGS, 0, 0, b""))
-        stranger.sendall(frame(HEADERS, END_HEADERS | END_STREAM, 1, block))
+    with path_that_is_no_text(server.server.port):
         eventually(lambda: httpx.get(f"{server.admin_url}/healthz").status_code == 503)
     assert httpx.get(f"{server.admin_url}/readyz").status_code == 503
     assert server.server.port_lost.is_set()
+    assert isinstance(server.server.port_lost_by, UnicodeDecodeError)
+
+
+def test_whatever_ends_the_loop_of_grpc_is_told() -> None:
+    told: list[BaseException] = []
+    error = RuntimeError("no more calls")
+
+    class Ending:
+        """Leaves a task behind, as grpc.aio does."""
+
+        async def start(self) -> None:
+            self.loop = asyncio.create_task(self.take_calls())
+
+        async def take_calls(self) -> None:
+            await asyncio.sleep(0)
+            raise error
+
+    async def watch() -> None:
+        server: Any = Ending()
+        await start_watched(server, told.append)
+        await asyncio.wait([server.loop])
+        await asyncio.sleep(0)
+
+    asyncio.run(watch())
+    assert told == [error]

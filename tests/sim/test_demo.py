@@ -7,12 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from comvla_sim import cli
 from comvla_sim.demo import server_process
+from comvla_sim.demo.fleet import FleetOfRobots
 from comvla_sim.demo.server_process import ServerProcess, ServerProcessError
 from comvla_sim.worlds.tabletop import Tabletop
 from comvla_vla import random_policy, save_policy
@@ -72,6 +74,36 @@ def test_the_demo_leaves_a_page_and_no_server(
     assert html.count("data:image/") == 2 * (1 + 12 // 2)
     (server,) = started
     assert server.returncode == 0
+
+
+def test_a_fleet_works_until_its_time_is_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watched: list[float | None] = []
+    watch = FleetOfRobots.watch
+
+    def shortly(self: FleetOfRobots, seconds: float | None, well: Callable[[], bool]) -> None:
+        watched.append(seconds)
+        assert well()
+        watch(self, seconds, well)
+        assert all(robot.is_alive() for robot, _ in self._robots)
+
+    monkeypatch.setattr(FleetOfRobots, "watch", shortly)
+    edge, cloud = random_policy(seed=0)
+    checkpoint = tmp_path / "policy"
+    statistics = unit_statistics(edge.config)
+    save_policy(checkpoint, edge.net, cloud.net, edge.prompt.tokenizer, statistics)
+    options = ["--fleet", "1", "--seconds", "0.5", "--model", str(checkpoint), "--json"]
+    assert cli.main(["demo", *options]) == 0
+    where, counts = capsys.readouterr().out.splitlines()
+    assert where.startswith("1 robots, to watch at http://127.0.0.1:")
+    assert json.loads(counts).keys() == {"episodes", "successes"}
+    assert watched == [0.5]
+
+
+def test_seconds_are_for_a_fleet_only(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--seconds", "3"]) != 0
+    assert "--fleet N" in capsys.readouterr().err
 
 
 def test_a_server_that_does_not_start_leaves_its_last_words() -> None:

@@ -78,10 +78,15 @@ def work(lifeline: Connection, share: Share) -> None:
     logging.disable(logging.CRITICAL)  # a million refusals
     announce(lifeline, str(os.getpid()))
 
-    def tell(done: int, at: int) -> None:
-        announce(lifeline, json.dumps({"done": done, "at": at}))
+    cases, began_s = share.cases(), time.time()
 
-    tally = asyncio.run(_run(share.cases(), share.until_s, tell))
+    def tell(done: int, at: int) -> None:
+        over = done / max(1, len(cases))
+        if math.isfinite(share.until_s):
+            over = max(over, (time.time() - began_s) / max(1e-9, share.until_s - began_s))
+        announce(lifeline, json.dumps({"done": done, "at": at, "share": min(1.0, over)}))
+
+    tally = asyncio.run(_run(cases, share.until_s, tell))
     announce(lifeline, json.dumps({"tally": tally.to_dict()}))
 
 

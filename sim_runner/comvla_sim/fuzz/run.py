@@ -9,7 +9,7 @@ import math
 import os
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, cast
@@ -19,17 +19,20 @@ import grpc
 from comvla.errors import ComVLAError
 from comvla.v1 import policy_pb2_grpc
 from comvla_sim.bench import environment
-from comvla_sim.bench.processes import connected
-from comvla_sim.fuzz import over_socket
+from comvla_sim.bench.processes import ProcessError, connected
+from comvla_sim.fuzz import connections, over_socket
 from comvla_sim.fuzz.cases import DESCRIPTIONS, Case
 from comvla_sim.fuzz.in_process import Share, run_one, work, wrong_with
 from comvla_sim.fuzz.mutations import payload
 from comvla_sim.fuzz.outcome import Tally
-from comvla_sim.fuzz.target import serve, valid_request
+from comvla_sim.fuzz.supervised import SupervisedServer
+from comvla_sim.fuzz.target import valid_request
 from comvla_sim.fuzz.watch import Watch
 
 # Of a limited time, the part of the cases in process.
 _IN_PROCESS_SHARE = 0.55
+# Of what is left, the part of the calls; the rest is for connections of frames.
+_CALLS_SHARE = 0.65
 _SETTLES_WITHIN_S = 15.0
 
 OnProgress = Callable[[int, int], None]
@@ -73,7 +76,10 @@ def run(
     else:
         progress = _Progress(parameters.requests, on_progress)
         watches += _in_process(parameters, tally, progress)
-        watches += _over_socket(parameters, tally, progress)
+        try:
+            watches += _over_socket(parameters, tally, progress)
+        except ProcessError as error:  # what was counted before stays
+            tally.fail("over sockets", "server", f"did not start: {error}")
     memory = [watch.verdict() for watch in watches]
     counts = tally.to_dict()
     return {
@@ -88,8 +94,12 @@ def run(
             if tally.kinds[kind]
         ],
         **counts,
+        "known_ends": counts["statuses"].get("frames", {}).get(connections.KNOWN_END, 0),
+        "grpcio": grpc.__version__,
         "memory": memory,
-        "passed": not tally.failed and not any(item["grew"] for item in memory),
+        "passed": bool(tally.kinds)
+        and not tally.failed
+        and not any(item["grew"] for item in memory),
     }
 
 
@@ -116,8 +126,10 @@ def _run_only(case: Case, tally: Tally) -> None:
     if case.in_process:
         tally.add(run_one(case).to_dict())
         return
-    with _server(tally) as (target, _):
-        asyncio.run(over_socket.run([case], target, tally, lambda done: None))
+    kind = connections if case.kind == "frames" else over_socket
+    with SupervisedServer() as server:
+        asyncio.run(kind.run([case], server, tally, lambda done: None))
+        _require_well(server, tally)
 
 
 def _in_process(parameters: FuzzParameters, tally: Tally, progress: _Progress) -> list[Watch]:
@@ -156,44 +168,47 @@ def _in_process(parameters: FuzzParameters, tally: Tally, progress: _Progress) -
                 else:
                     at[lifeline] = said["at"]
                     progress.note(share.index, said["done"])
-                    watch.look((said["at"] - share.first) / max(1, share.last - share.first))
+                    watch.look(said["share"])
     return watches
 
 
 def _over_socket(parameters: FuzzParameters, tally: Tally, progress: _Progress) -> list[Watch]:
+    """Calls to one server, then frames to it, which may end it: another takes its place."""
     cases = [
         case
         for case in (Case(parameters.seed, n) for n in range(parameters.requests))
         if not case.in_process
     ]
-    until_s = math.inf
+    calls = [case for case in cases if case.kind != "frames"]
+    frames = [case for case in cases if case.kind == "frames"]
+    began_s = time.monotonic()
+    left_s = math.inf
     if parameters.seconds is not None:
-        until_s = time.monotonic() + (1 - _IN_PROCESS_SHARE) * parameters.seconds
-    with _server(tally) as (target, pid):
-        watch = Watch("server", pid)
+        left_s = (1 - _IN_PROCESS_SHARE) * parameters.seconds
+    before = 0
+
+    with SupervisedServer() as server:
 
         def tell(done: int) -> None:
-            progress.note("socket", done)
-            watch.look(done / max(1, len(cases)))
+            progress.note("socket", before + done)
+            share = (before + done) / max(1, len(cases))
+            server.look(min(1.0, max(share, (time.monotonic() - began_s) / left_s)))
 
-        asyncio.run(over_socket.run(cases, target, tally, tell, until_s))
-        _settle(watch)
-    return [watch]
+        asyncio.run(over_socket.run(calls, server, tally, tell, began_s + _CALLS_SHARE * left_s))
+        _require_well(server, tally)
+        if server.ended() is not None:
+            server.restart()
+        before = len(calls)
+        asyncio.run(connections.run(frames, server, tally, tell, began_s + left_s))
+        _settle(server.watches[-1])
+        _require_well(server, tally)
+    return server.watches
 
 
-@contextlib.contextmanager
-def _server(tally: Tally) -> Iterator[tuple[str, int]]:
-    """The server in a process of its own, which has to be well at the end.
-
-    Yields:
-        Where it listens, and its process.
-    """
-    with connected(serve) as (_, announcement):
-        target, admin_url, pid = announcement.split()
-        yield target, int(pid)
-        what = _unwell(target, admin_url)
-        if what:
-            tally.fail("afterwards", "server", what)
+def _require_well(server: SupervisedServer, tally: Tally) -> None:
+    what = _unwell(server.target, server.admin_url)
+    if what:
+        tally.fail("afterwards", "server", what)
 
 
 def _unwell(target: str, admin_url: str) -> str:

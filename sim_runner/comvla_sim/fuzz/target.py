@@ -18,7 +18,7 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.image_decoders import DECODERS, ImageDecoder
 from comvla_server.settings import ServerSettings
-from comvla_sim.bench.processes import announce, wait_for_end
+from comvla_sim.bench.processes import announce
 from comvla_vla.request import ImageRequest, PolicyRequest
 
 INFO = ModelInfo(
@@ -36,6 +36,7 @@ INFO = ModelInfo(
     delta_actions=(True, False),
 )
 CODINGS = ("jpeg", "webp", "avif", "h264")
+_LOOKS_EVERY_S = 0.05
 SETTINGS = ServerSettings(max_request_bytes=64 * 1024, max_sessions=256, request_timeout_s=2.0)
 
 
@@ -128,8 +129,15 @@ def valid_request(session: str, step: int, payload: bytes) -> policy_pb2.InferRe
 
 
 def serve(lifeline: Connection) -> None:
-    """The real server in this process, until the lifeline is cut; announces where it listens."""
+    """The real server in this process, until the lifeline is cut; announces where it listens.
+
+    Where gRPC stops taking calls before, announces what it raised, and ends.
+    """
     logging.disable(logging.CRITICAL)  # a hundred thousand refusals
     with BackgroundServer(engine(), SETTINGS) as server:
         announce(lifeline, f"{server.target} {server.admin_url} {os.getpid()}")
-        wait_for_end(lifeline)
+        while not lifeline.poll(_LOOKS_EVERY_S):
+            if server.server.port_lost.is_set():
+                server.stop(0.0)
+                announce(lifeline, type(server.server.port_lost_by).__name__)
+                return

@@ -35,6 +35,8 @@ class Watch:
             descriptors = len(os.listdir(folder / "fd"))
         except (OSError, ValueError, IndexError):
             return
+        if pages == 0:  # it has ended, and nobody has asked yet how
+            return
         self.samples.append((share, pages * os.sysconf("SC_PAGE_SIZE"), descriptors))
 
     def verdict(self) -> dict[str, Any]:
