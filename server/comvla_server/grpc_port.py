@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable
 
 import grpc
-
-_log = logging.getLogger(__name__)
 
 
 async def start_watched(server: grpc.aio.Server, on_end: Callable[[BaseException], None]) -> None:
@@ -22,7 +19,8 @@ async def start_watched(server: grpc.aio.Server, on_end: Callable[[BaseException
 
     Args:
         server: bound, not started.
-        on_end: called once, on the event loop, with what ended it.
+        on_end: called once, on the event loop, with what ended it. A server that is being stopped
+            may end so, too.
     """
 
     def ended(task: asyncio.Task[object]) -> None:
@@ -31,7 +29,6 @@ async def start_watched(server: grpc.aio.Server, on_end: Callable[[BaseException
         error = task.exception()
         if error is None:
             return
-        _log.critical("gRPC stopped taking calls: %s", ascii(error)[:200])
         on_end(error)
 
     before = asyncio.all_tasks()

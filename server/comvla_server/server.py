@@ -203,6 +203,9 @@ class Server:
 
     def _lose_port(self, error: BaseException) -> None:
         """Robots are not answered any more, and will not be: /healthz and /readyz say so."""
+        if self.lifecycle.phase in (Phase.DRAINING, Phase.STOPPED):
+            return
+        _log.critical("gRPC stopped taking calls: %s", ascii(error)[:200])
         self.port_lost_by = error
         self.lifecycle.enter(Phase.STOPPED)
         self.port_lost.set()

@@ -69,7 +69,13 @@ def test_the_server_guide_states_the_limits_that_are_in_force() -> None:
     stated = {row[0].strip("`"): float(row[1]) for row in markdown.table(SERVER, "option")}
     assert stated == {flag: fields[flag].serve_default for flag in stated}
     numbers = {flag for flag, field in fields.items() if field.kind in (int, float)}
-    elsewhere = {"--port", "--admin-port", "--reload-interval-s", "--session-ttl-s"}
+    elsewhere = {
+        "--port",
+        "--admin-port",
+        "--reload-interval-s",
+        "--session-ttl-s",
+        "--otel-sample",
+    }
     assert set(stated) == numbers - elsewhere
 
 

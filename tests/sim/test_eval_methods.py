@@ -216,7 +216,7 @@ def test_a_class_of_ones_own_is_a_method(
 def test_fastv_runs_in_the_cloud_half_of_its_own_episodes_only() -> None:
     worker = Worker(SETTINGS)
     try:
-        targets = [worker._target(find_method(name)) for name in ("full", "fastv", "jpeg-75")]
+        targets = [worker.target(find_method(name)) for name in ("full", "fastv", "jpeg-75")]
         assert targets[0] is targets[2] is not targets[1]
         clouds = [target._engine._cloud for target in targets[:2]]  # type: ignore[union-attr]
         assert clouds[0].net is clouds[1].net

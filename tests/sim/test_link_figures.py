@@ -14,7 +14,7 @@ from comvla_sim import cli
 from comvla_sim.experiments import runner
 from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.plan import EpisodeSpec
-from comvla_sim.figures import measuring
+from comvla_sim.figures import measuring, running
 from comvla_sim.figures.points import pairs, points
 from comvla_sim.figures.series import SERIES, USEFUL_TOKENS
 from comvla_sim.figures.sweeps import SWEEPS
@@ -189,7 +189,7 @@ def test_quick_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         asked.append(len(wanted))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(measuring, "measure", no_measuring)
+    monkeypatch.setattr(running, "measure", no_measuring)
     for name in SWEEPS:
         for options in (("--quick",), ()):
             assert figure(name, tmp_path, *options) == 130
