@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from comvla.errors import ComVLAError
 from comvla_server import logs
 from comvla_server.descriptors import allow_descriptors
 from comvla_server.model_loading import load_engine
@@ -132,11 +131,11 @@ def _refresh_on_hangup(server: Server) -> None:
 
     async def refresh() -> None:
         server.reload()
-        try:
-            if not await server.swapper.refresh():
-                _log.info("no checkpoint has changed")
-        except ComVLAError as error:
-            _log.error("the models that serve go on: %s", error)
+        replaced, troubles = await server.swapper.refresh()
+        for trouble in troubles:
+            _log.error("the model that serves goes on: %s", trouble)
+        if not replaced and not troubles:
+            _log.info("no checkpoint has changed")
 
     def on_hangup() -> None:
         task = asyncio.ensure_future(refresh())

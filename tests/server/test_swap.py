@@ -29,6 +29,7 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.identity import MAY_SWAP, Identity
 from comvla_server.model_loading import Candidate
+from comvla_server.server import Server
 from comvla_server.settings import ServerSettings
 from comvla_server.tokens import TokenLine
 
@@ -372,6 +373,21 @@ def test_the_command_asks_and_tells(
     assert "nothing was replaced: 'nowhere'" in capsys.readouterr().err
     assert cli.main(["swap", "again", "--admin", "http://127.0.0.1:1", *where[2:]]) == 2
     assert "admin surface of a server at http://127.0.0.1:1" in capsys.readouterr().err
+
+
+async def test_a_bad_checkpoint_is_not_in_the_way_of_the_next(loader: StubLoader) -> None:
+    server = Server(
+        {name: Engine(answering(0.0), edge_identity="same eyes") for name in ("one", "two", "six")},
+        sources={"one": "nowhere", "two": "tuned", "six": "wider"},
+        loader=loader,
+    )
+    await server.start()
+    try:
+        replaced, troubles = await server.swapper.refresh()
+    finally:
+        await server.stop()
+    assert [report.model for report in replaced] == ["two"]
+    assert [trouble.trouble for trouble in troubles] == ["checkpoint", "robots"]
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
