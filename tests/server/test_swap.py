@@ -12,8 +12,9 @@ import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import grpc
 import httpx
@@ -388,6 +389,50 @@ async def test_a_bad_checkpoint_is_not_in_the_way_of_the_next(loader: StubLoader
         await server.stop()
     assert [report.model for report in replaced] == ["two"]
     assert [trouble.trouble for trouble in troubles] == ["checkpoint", "robots"]
+
+
+class Impostor(BaseHTTPRequestHandler):
+    """Answers at ``/redirects`` with the way to ``/``, elsewhere with JSON that is no report."""
+
+    seen: ClassVar[list[str]] = []
+
+    def do_POST(self) -> None:
+        self.seen.append(self.path)
+        self.rfile.read(int(self.headers["content-length"]))
+        self.send_response(302 if self.path.startswith("/redirects") else 200)
+        self.send_header("location", "/")
+        self.end_headers()
+        self.wfile.write(b'{"robots": "same"}')
+
+    do_GET = do_POST
+
+    def log_message(self, *_: Any) -> None:
+        """Nothing."""
+
+
+def test_the_command_gives_the_token_to_nobody_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    token = tmp_path / "operator.token"
+    token.write_text(OPERATOR)
+
+    def asking(admin: str) -> str:
+        assert cli.main(["swap", "again", "--admin", admin, "--token-file", str(token)]) == 2
+        return capsys.readouterr().err
+
+    with HTTPServer(("127.0.0.1", 0), Impostor) as impostor:
+        thread = threading.Thread(target=impostor.serve_forever)
+        thread.start()
+        url = f"http://127.0.0.1:{impostor.server_port}"
+        try:
+            assert "nothing was replaced: 302" in asking(f"{url}/redirects")
+            assert "expected the report of a swap" in asking(f"{url}/other")
+        finally:
+            impostor.shutdown()
+            thread.join()
+    assert Impostor.seen == ["/redirects/v1/models/swap", "/other/v1/models/swap"]
+    assert "--insecure" in asking("http://192.0.2.1:8080")
+    assert "http://… or https://…" in asking("http://[")
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
