@@ -12,6 +12,7 @@ import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from http.client import HTTPConnection, RemoteDisconnected
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any, ClassVar
@@ -346,6 +347,40 @@ def test_only_operators_may(server: BackgroundServer, loader: StubLoader) -> Non
         answer = swap(open_server, "again")
         assert answer.status_code == 403
         assert "--admin-tokens-file" in answer.json()["detail"]
+
+
+def begin_order(server: BackgroundServer, token: str, announced: int) -> HTTPConnection:
+    """An order of which the head is sent, and nothing else."""
+    connection = HTTPConnection("127.0.0.1", server.server.admin_port, timeout=PATIENCE_S)
+    connection.putrequest("POST", "/v1/models/swap")
+    connection.putheader("Authorization", f"Bearer {token}")
+    connection.putheader("Content-Type", "application/json")
+    connection.putheader("Content-Length", str(announced))
+    connection.endheaders()
+    return connection
+
+
+def test_an_order_is_not_read_before_it_is_known_who_sends_it(server: BackgroundServer) -> None:
+    for token, status in (("cvt_nobody", 401), (PROMETHEUS, 403)):
+        connection = begin_order(server, token, 10**9)
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_an_order_is_read_up_to_a_size(server: BackgroundServer) -> None:
+    assert swap(server, "a" * 20_000).status_code == 413
+    connection = begin_order(server, OPERATOR, 10**9)
+    connection.send(b" " * 20_000)
+    assert connection.getresponse().status == 413
+    connection.close()
+
+
+def test_an_order_has_to_arrive_in_time(loader: StubLoader, tokens: Path) -> None:
+    settings = ServerSettings(admin_tokens_file=tokens, request_timeout_s=0.2)
+    with BackgroundServer(lambda: loader.load("first"), settings, loader=loader) as server:
+        connection = begin_order(server, OPERATOR, 100)
+        with pytest.raises((RemoteDisconnected, ConnectionError)):
+            connection.getresponse()
 
 
 @pytest.mark.parametrize(
