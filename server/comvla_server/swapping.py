@@ -170,10 +170,12 @@ class Swapper:
                 troubles.append(error)
         return reports, troubles
 
-    def close(self) -> None:
-        """Waits for nothing any more."""
-        for task in self._retiring:
+    async def close(self) -> None:
+        """Waits for nothing any more: replaced models that are still asked refuse who waits."""
+        retiring = list(self._retiring)
+        for task in retiring:
             task.cancel()
+        await asyncio.gather(*retiring, return_exceptions=True)
 
     def _find(self, model: str) -> Runtime:
         try:
@@ -285,8 +287,10 @@ class Swapper:
         self._metrics.describe_model(engine.info, server_version())
 
     async def _retire(self, old: Runtime) -> bool:
-        await old.users.none.wait()
-        await old.batcher.close()
+        try:
+            await old.users.none.wait()
+        finally:
+            await old.batcher.close()
         return True
 
 

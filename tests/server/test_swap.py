@@ -411,6 +411,21 @@ def test_the_command_asks_and_tells(
     assert "admin surface of a server at http://127.0.0.1:1" in capsys.readouterr().err
 
 
+async def test_a_replaced_model_that_is_still_asked_is_closed_with_the_server(
+    loader: StubLoader,
+) -> None:
+    settings = ServerSettings(grace_s=0.05)
+    server = Server(lambda: loader.load("first"), settings, sources={"": "first"}, loader=loader)
+    await server.start()
+    assert server._service is not None
+    (old,) = server._service.models
+    with old.users.one():
+        assert not (await server.swapper.swap("", "again")).freed
+        assert old.batcher.alive
+        await server.stop()
+        assert not old.batcher.alive
+
+
 async def test_a_bad_checkpoint_is_not_in_the_way_of_the_next(loader: StubLoader) -> None:
     server = Server(
         {name: Engine(answering(0.0), edge_identity="same eyes") for name in ("one", "two", "six")},
