@@ -76,6 +76,7 @@ async def _serve(settings: ServerSettings, loads: Mapping[str, Callable[[], Engi
     stop = _stop_on_signals()
     server = Server(loads, settings, sources=settings.models)
     await server.bind()
+    _refresh_on_hangup(server)
     ready = asyncio.create_task(server.make_ready(_settle))
     stopping = asyncio.create_task(stop.wait())
     lost = asyncio.create_task(server.port_lost.wait())
@@ -89,7 +90,6 @@ async def _serve(settings: ServerSettings, loads: Mapping[str, Callable[[], Engi
                 f"model={info.name}{names}",
                 flush=True,
             )
-            _refresh_on_hangup(server)
             await asyncio.wait({stopping, lost}, return_when=asyncio.FIRST_COMPLETED)
     finally:
         ready.cancel()
@@ -126,11 +126,14 @@ def _stop_on_signals() -> asyncio.Event:
 
 
 def _refresh_on_hangup(server: Server) -> None:
-    """SIGHUP: certificates, tokens and checkpoints that have changed are taken over."""
+    """SIGHUP: certificates, tokens and checkpoints that have changed are taken over; certificates and
+    tokens only while the model loads, which reads its checkpoint as it is."""
     under_way: set[asyncio.Task[None]] = set()
 
     async def refresh() -> None:
         server.reload()
+        if not server.lifecycle.ready:
+            return
         replaced, troubles = await server.swapper.refresh()
         for trouble in troubles:
             _log.error("the model that serves goes on: %s", trouble)
