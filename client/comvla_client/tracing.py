@@ -100,8 +100,23 @@ class Tracing:
     @contextmanager
     def step(self) -> Iterator[StepTrace]:
         """Around a step."""
-        with self._tracer.start_as_current_span("comvla.step") as span:
+        with _span(self._tracer, "comvla.step") as span:
             yield StepTrace(self._tracer, self._propagator, span)
+
+
+@contextmanager
+def _span(tracer: Any, name: str, **how: Any) -> Iterator[Any]:
+    """A current span. Of an error it keeps the kind alone: the words name sessions and identities."""
+    from opentelemetry.trace import Status, StatusCode
+
+    with tracer.start_as_current_span(
+        name, record_exception=False, set_status_on_exception=False, **how
+    ) as span:
+        try:
+            yield span
+        except Exception as error:
+            span.set_status(Status(StatusCode.ERROR, type(error).__name__))
+            raise
 
 
 class StepTrace:
@@ -128,7 +143,7 @@ class StepTrace:
         """Around the call: sending, and waiting for the answer."""
         from opentelemetry.trace import SpanKind
 
-        with self._tracer.start_as_current_span("comvla.call", kind=SpanKind.CLIENT):
+        with _span(self._tracer, "comvla.call", kind=SpanKind.CLIENT):
             carrier: dict[str, str] = {}
             self._propagator.inject(carrier)
             token = _HEADERS.set(tuple(carrier.items()))
@@ -156,8 +171,9 @@ class StepTrace:
         if report.fallback_reason is not None:
             from opentelemetry.trace import Status, StatusCode
 
+            # The reason alone: the detail may name sessions and identities.
             span.set_attribute("comvla.fallback_reason", report.fallback_reason)
-            span.set_status(Status(StatusCode.ERROR, report.detail))
+            span.set_status(Status(StatusCode.ERROR, report.fallback_reason))
 
     def _phase(self, name: str, zero_ns: int, begin_s: float, end_s: float) -> None:
         span = self._tracer.start_span(name, start_time=zero_ns + int(1e9 * begin_s))

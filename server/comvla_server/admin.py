@@ -99,6 +99,9 @@ def create_app(
         title="ComVLA server",
         version=server_version(),
         description="Admin surface of a ComVLA policy server. Robots talk gRPC on the other port.",
+        # FastAPI's pages load scripts of other hosts into the origin that holds an operator's token.
+        docs_url=None,
+        redoc_url=None,
     )
 
     def loaded() -> Runtime:

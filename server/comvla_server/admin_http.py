@@ -9,6 +9,7 @@ import ssl
 from collections.abc import Iterator
 from typing import Any
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -119,15 +120,13 @@ def _protocol(request_timeout_s: float) -> type[asyncio.Protocol]:
             self._wait()
 
         def data_received(self, data: bytes) -> None:
-            before = self.cycle
             super().data_received(data)
-            if self.cycle is not before:  # a request has begun, its head is complete
+            if not self._arriving():
                 self._done()
 
         def on_response_complete(self) -> None:
-            answered = self.cycle
             super().on_response_complete()
-            if self.cycle is answered and not self.transport.is_closing():
+            if self._arriving() and not self.transport.is_closing():
                 self._wait()
 
         def pause_writing(self) -> None:
@@ -142,6 +141,10 @@ def _protocol(request_timeout_s: float) -> type[asyncio.Protocol]:
             self._done()
             self._flowing()
             super().connection_lost(exc)
+
+        def _arriving(self) -> bool:
+            """Whether a request is awaited, or the rest of one: of its head, or of its body."""
+            return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
 
         def _flowing(self) -> None:
             if self._stalled is not None:

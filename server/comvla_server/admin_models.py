@@ -6,13 +6,18 @@ from collections.abc import Callable
 from typing import Any
 
 from fastapi import FastAPI, HTTPException, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from starlette.requests import ClientDisconnect
 
 from comvla_server.admin_auth import MAY_SWAP, rights_of
 from comvla_server.models import Models
 from comvla_server.settings import ServerSettings
 from comvla_server.swapping import SwapError, Swapper, Trouble
+
+MOST_ORDER_BYTES = 16 * 1024
+"""Size of an order; larger ones are refused unread."""
 
 _STATUS: dict[Trouble, int] = {
     "unknown": 404,
@@ -110,9 +115,17 @@ def add_model_routes(
         "/v1/models/swap",
         summary="Replace a model while robots use it",
         responses={code: {"description": words} for code, words in _RESPONSES.items()},
+        openapi_extra={
+            "requestBody": {
+                "required": True,
+                "content": {"application/json": {"schema": SwapOrder.model_json_schema()}},
+            }
+        },
     )
-    async def swap(order: SwapOrder, request: Request) -> SwapDone:
+    async def swap(request: Request) -> SwapDone:
+        # FastAPI would read an order of any size before it is known who sends it.
         _check_operator(request, settings)
+        order = await _order(request)
         at_work = swapper()
         if at_work is None:
             raise HTTPException(503, "the model is still loading: ask again when /readyz is 200")
@@ -132,10 +145,36 @@ _RESPONSES = {
     403: "No operator's token",
     404: "No model of that name",
     409: "Another swap is under way, or robots could not work with that checkpoint",
+    413: "More than any order takes",
     422: "A checkpoint that cannot be used, or an order that makes no sense",
     503: "The server loads or drains",
     507: "Too little memory for both models",
 }
+
+
+async def _order(request: Request) -> SwapOrder:
+    """Reads an order.
+
+    Raises:
+        HTTPException: it is too large, or ends before its time.
+        RequestValidationError: it makes no sense.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise HTTPException(422, f"expected Content-Type: application/json, got {kind!r}")
+    content = bytearray()
+    try:
+        async for piece in request.stream():
+            content += piece
+            if len(content) > MOST_ORDER_BYTES:
+                raise HTTPException(413, f"expected an order of at most {MOST_ORDER_BYTES} bytes")
+    except ClientDisconnect as error:
+        raise HTTPException(400, "expected a whole order, the connection was closed") from error
+    try:
+        return SwapOrder.model_validate_json(bytes(content))
+    except ValidationError as error:
+        troubles = error.errors(include_url=False, include_context=False)
+        raise RequestValidationError(troubles) from error
 
 
 def _check_operator(request: Request, settings: ServerSettings) -> None:

@@ -30,11 +30,22 @@ FORGOTTEN_AFTER_S = 60.0
 
 _INSTRUCTION_CHARS = 200
 
-# Whoever was refused for one of these had a request that the server could have answered. Others may
-# be made up, and nobody gets a row of the table by making something up.
+# Whoever was refused for one of these had a request that this server, or one with the model that it
+# names, could have answered. Others may be made up, and nobody gets a row of the table by making
+# something up.
 _EARNEST = frozenset(
     reason.value
-    for reason in (Reason.OVERLOAD, Reason.DEADLINE, Reason.SUPERSEDED, Reason.SHORT, Reason.MODEL)
+    for reason in (
+        Reason.OVERLOAD,
+        Reason.PREDICTED_LATE,
+        Reason.CONGESTED,
+        Reason.FAIR_SHARE,
+        Reason.DEADLINE,
+        Reason.SUPERSEDED,
+        Reason.SHORT,
+        Reason.MODEL,
+        Reason.UNKNOWN_MODEL,
+    )
 )
 _ANSWERED = frozenset({"ok", "repeat"})
 # Nobody bridges more within a silence that is not yet forgotten; larger gaps are made up.

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from comvla.errors import ComVLAError
 from comvla_server import logs
 from comvla_server.descriptors import allow_descriptors
 from comvla_server.model_loading import load_engine
@@ -77,6 +76,7 @@ async def _serve(settings: ServerSettings, loads: Mapping[str, Callable[[], Engi
     stop = _stop_on_signals()
     server = Server(loads, settings, sources=settings.models)
     await server.bind()
+    _refresh_on_hangup(server)
     ready = asyncio.create_task(server.make_ready(_settle))
     stopping = asyncio.create_task(stop.wait())
     lost = asyncio.create_task(server.port_lost.wait())
@@ -127,16 +127,19 @@ def _stop_on_signals() -> asyncio.Event:
 
 
 def _refresh_on_hangup(server: Server) -> None:
-    """SIGHUP: certificates, tokens and checkpoints that have changed are taken over."""
+    """SIGHUP: certificates, tokens and checkpoints that have changed are taken over; certificates and
+    tokens only while the model loads, which reads its checkpoint as it is."""
     under_way: set[asyncio.Task[None]] = set()
 
     async def refresh() -> None:
         server.reload()
-        try:
-            if not await server.swapper.refresh():
-                _log.info("no checkpoint has changed")
-        except ComVLAError as error:
-            _log.error("the models that serve go on: %s", error)
+        if not server.lifecycle.ready:
+            return
+        replaced, troubles = await server.swapper.refresh()
+        for trouble in troubles:
+            _log.error("the model that serves goes on: %s", trouble)
+        if not replaced and not troubles:
+            _log.info("no checkpoint has changed")
 
     def on_hangup() -> None:
         task = asyncio.ensure_future(refresh())

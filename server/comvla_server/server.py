@@ -234,7 +234,7 @@ class Server:
         await self._health.draining()
         finished = await self._drain(self.settings.grace_s if grace_s is None else grace_s)
         if self._swapper is not None:
-            self._swapper.close()
+            await self._swapper.close()
         if self._tracing is not None:
             await asyncio.to_thread(self._tracing.close)
         if self._grpc is not None:

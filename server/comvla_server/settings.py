@@ -96,7 +96,7 @@ class ServerSettings:
     )
     admin_port: int = setting(
         0,
-        "HTTP port of /metrics, /readyz and /docs, 0 for a free one",
+        "HTTP port of /metrics, /readyz and the page, 0 for a free one",
         NETWORK,
         metavar="PORT",
         high=65535,

@@ -6,12 +6,14 @@ import argparse
 import json
 import ssl
 import urllib.error
+import urllib.parse
 import urllib.request
 from pathlib import Path
 from typing import Any
 
 from comvla.errors import ComVLAError
 from comvla.number_arguments import SECONDS
+from comvla_server.ports import is_loopback
 
 _DESCRIPTION = """\
 Replace a model of a server while robots use it.
@@ -56,6 +58,11 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--tls-ca", type=Path, metavar="FILE", help="authorities to trust, PEM")
     parser.add_argument(
+        "--insecure",
+        action="store_true",
+        help="send the token in the clear to another machine: whoever is on the way may swap, too",
+    )
+    parser.add_argument(
         "--new-edge", action="store_true", help="also where robots need another edge half"
     )
     parser.add_argument("--check", action="store_true", help="replace nothing")
@@ -78,14 +85,13 @@ def run(args: argparse.Namespace) -> int:
         "new_edge": args.new_edge,
         "check": args.check,
     }
-    report = _post(args, order)
+    report = _report(_post(args, order), args.admin)
     print(json.dumps(report) if args.json else _words(report))
     return 0
 
 
-def _post(args: argparse.Namespace, order: dict[str, Any]) -> dict[str, Any]:
-    if not args.admin.startswith(("http://", "https://")):
-        raise SwapRefusedError(f"expected --admin as http://… or https://…, got {args.admin!r}")
+def _post(args: argparse.Namespace, order: dict[str, Any]) -> Any:
+    _check_address(args.admin, insecure=args.insecure)
     try:
         token = args.token_file.read_text(encoding="ascii").strip()
         trust = None
@@ -98,13 +104,12 @@ def _post(args: argparse.Namespace, order: dict[str, Any]) -> dict[str, Any]:
         data=json.dumps(order).encode(),
         headers={"Authorization": f"Bearer {token}", "Content-Type": "application/json"},
     )
-    handlers: list[Any] = [urllib.request.ProxyHandler({})]
+    handlers: list[Any] = [urllib.request.ProxyHandler({}), _NoRedirects()]
     if trust is not None:
         handlers.append(urllib.request.HTTPSHandler(context=trust))
     try:
         with urllib.request.build_opener(*handlers).open(request, timeout=args.timeout_s) as answer:
-            report: dict[str, Any] = json.load(answer)
-            return report
+            return json.load(answer)
     except urllib.error.HTTPError as error:
         raise SwapRefusedError(f"nothing was replaced: {_detail(error)}") from error
     except (OSError, ValueError) as error:
@@ -112,6 +117,53 @@ def _post(args: argparse.Namespace, order: dict[str, Any]) -> dict[str, Any]:
             f"expected the admin surface of a server at {args.admin}, got {error}: correct --admin; "
             "where the answer was lost, GET /v1/models says what serves now"
         ) from error
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Takes a redirect for an error: the token is for one address."""
+
+    def redirect_request(self, *_: Any, **__: Any) -> None:
+        return None
+
+
+def _check_address(admin: str, *, insecure: bool) -> None:
+    try:
+        address = urllib.parse.urlsplit(admin)
+        host = address.hostname
+    except ValueError:
+        host = None
+    if not host or address.scheme not in ("http", "https"):
+        raise SwapRefusedError(f"expected --admin as http://… or https://…, got {admin!r}")
+    if address.scheme == "http" and not insecure and not is_loopback(host):
+        raise SwapRefusedError(
+            f"{admin} would get the token in the clear: expected https:// beyond this machine; "
+            "give --insecure where the network is trusted"
+        )
+
+
+def _report(answer: Any, admin: str) -> dict[str, Any]:
+    """An answer that is a report, whole."""
+    numbers = ("needed_bytes", "load_s", "warm_up_s", "drain_s")
+    if (
+        isinstance(answer, dict)
+        and all(isinstance(answer.get(name), str) for name in ("before", "after"))
+        and answer.get("robots") in _ROBOTS
+        and all(isinstance(answer.get(name), (int, float)) for name in numbers)
+        and isinstance(answer.get("available_bytes", ""), (int, float, type(None)))
+        and all(isinstance(answer.get(name), bool) for name in ("swapped", "freed"))
+    ):
+        return answer
+    raise SwapRefusedError(
+        f"expected the report of a swap from {admin}, got {json.dumps(answer)[:200]}: correct "
+        "--admin; GET /v1/models says what serves now"
+    )
+
+
+_ROBOTS = {
+    "same": "the same model",
+    "compatible": "robots go on with the edge half they have",
+    "new_edge": "robots need another edge half",
+}
 
 
 def _detail(error: urllib.error.HTTPError) -> str:
@@ -128,12 +180,7 @@ def _words(report: dict[str, Any]) -> str:
     room = f"{need / 1e6:.0f} MB needed"
     if there is not None:
         room += f", {there / 1e6:.0f} MB available"
-    robots = {
-        "same": "the same model",
-        "compatible": "robots go on with the edge half they have",
-        "new_edge": "robots need another edge half",
-    }[report["robots"]]
-    line = f"{report['before']} -> {report['after']}: {robots}; {room}"
+    line = f"{report['before']} -> {report['after']}: {_ROBOTS[report['robots']]}; {room}"
     if not report["swapped"]:
         return f"checked only: {line}"
     return (

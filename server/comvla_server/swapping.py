@@ -149,26 +149,33 @@ class Swapper:
             self._busy = ""
             thread.close(timeout_s=0.0)
 
-    async def refresh(self) -> list[SwapReport]:
+    async def refresh(self) -> tuple[list[SwapReport], list[SwapError]]:
         """Replaces every model whose checkpoint is another by now; those that are not stay.
 
-        Raises:
-            SwapError: a checkpoint that cannot be used, or that robots could not work with.
+        Returns:
+            What was replaced, and why others were not: a checkpoint that cannot be used, or that
+            robots could not work with, is not in the way of the next.
         """
-        reports = []
+        reports: list[SwapReport] = []
+        troubles: list[SwapError] = []
         for runtime in self._models:
             source = self.sources.get(runtime.name)
             if source is None:
                 continue
-            there = await self.swap(runtime.name, source, check=True)
-            if there.after != there.before:
-                reports.append(await self.swap(runtime.name, source))
-        return reports
+            try:
+                there = await self.swap(runtime.name, source, check=True)
+                if there.after != there.before:
+                    reports.append(await self.swap(runtime.name, source))
+            except SwapError as error:
+                troubles.append(error)
+        return reports, troubles
 
-    def close(self) -> None:
-        """Waits for nothing any more."""
-        for task in self._retiring:
+    async def close(self) -> None:
+        """Waits for nothing any more: replaced models that are still asked refuse who waits."""
+        retiring = list(self._retiring)
+        for task in retiring:
             task.cancel()
+        await asyncio.gather(*retiring, return_exceptions=True)
 
     def _find(self, model: str) -> Runtime:
         try:
@@ -280,8 +287,10 @@ class Swapper:
         self._metrics.describe_model(engine.info, server_version())
 
     async def _retire(self, old: Runtime) -> bool:
-        await old.users.none.wait()
-        await old.batcher.close()
+        try:
+            await old.users.none.wait()
+        finally:
+            await old.batcher.close()
         return True
 
 

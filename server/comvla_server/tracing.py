@@ -94,8 +94,9 @@ class Tracing:
         try:
             yield
         except Refusal as refusal:
+            # The reason alone: the message names sessions and identities.
             span.set_attribute("comvla.refusal", refusal.reason.value)
-            span.set_status(Status(StatusCode.ERROR, refusal.message))
+            span.set_status(Status(StatusCode.ERROR, refusal.reason.value))
             raise
         finally:
             _CURRENT.reset(token)

@@ -136,6 +136,13 @@ def test_a_step_without_an_answer_says_why(
         if span.name == "comvla.step"
     ]
     assert reasons[0] == "unavailable"
+    # Words of errors name sessions and identities: a trace has the reason alone.
+    for span in spans.get_finished_spans():
+        assert span.events == ()
+        if span.name == "comvla.step":
+            assert span.status.description == span.attributes["comvla.fallback_reason"]
+        elif not span.status.is_ok and span.status.description is not None:
+            assert span.status.description.isidentifier()
     assert not any(
         span.status.is_ok for span in spans.get_finished_spans() if span.name == "comvla.step"
     )
@@ -152,7 +159,7 @@ def test_a_refusal_marks_the_servers_span(traced_server: BackgroundServer, spans
         with pytest.raises(grpc.RpcError):
             stub.Infer(policy_pb2.InferRequest(), metadata=[("traceparent", "nonsense")])
     (span,) = spans.get_finished_spans()
-    assert span.attributes["comvla.refusal"] == "mismatch"
+    assert span.attributes["comvla.refusal"] == span.status.description == "mismatch"
     assert span.parent is None
 
 

@@ -103,3 +103,10 @@ async def test_model_and_sessions_are_unavailable_while_loading(cloud: StubCloud
             assert "comvla_server_ready 0.0" in (await http.get("/metrics")).text
     finally:
         await server.stop()
+
+
+@pytest.mark.parametrize("path", ["/docs", "/docs/oauth2-redirect", "/redoc"])
+def test_no_page_loads_scripts_of_other_hosts(http: httpx.Client, path: str) -> None:
+    assert http.get(path).status_code == 404
+    assert "/v1/model" in http.get("/openapi.json").json()["paths"]
+    assert 'href="/docs"' not in http.get("/").text

@@ -18,7 +18,7 @@ from comvla_server.settings import ServerSettings
 from comvla_server.tokens import TokenLine, TokensError, new_token
 
 OPERATOR, ARM = new_token(), new_token()
-SHUT = ("/metrics", "/v1/model", "/v1/sessions", "/docs", "/openapi.json", "/nowhere")
+SHUT = ("/metrics", "/v1/model", "/v1/sessions", "/openapi.json", "/nowhere")
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -228,6 +229,32 @@ def test_a_server_that_grpc_has_left_ends_with_code_1(
         losing = pool.submit(lose)
         assert cli.main(["serve", *FREE_PORTS]) == 1
         losing.result()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
+@pytest.mark.usefixtures("logging_as_it_was")
+def test_a_hangup_while_the_model_loads_looks_at_tokens_only(
+    monkeypatch: pytest.MonkeyPatch, cloud: StubCloud, capsys: pytest.CaptureFixture[str]
+) -> None:
+    looked, lived = threading.Event(), signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    monkeypatch.setattr("comvla_server.access.Access.look", lambda _: looked.set())
+    cloud.hold()
+
+    def operator(robot: Robot) -> None:
+        cloud.wait_until_running()
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert looked.wait(PATIENCE_S)
+        cloud.release()
+        eventually(lambda: health_of(robot) == SERVING)
+
+    try:
+        serve_here(monkeypatch, cloud, operator)
+    finally:
+        signal.signal(signal.SIGHUP, lived)
+    stdout, stderr = capsys.readouterr()
+    assert "ready" in stdout
+    assert "Traceback" not in stderr
+    assert "never retrieved" not in stderr
 
 
 def findings(target: str) -> list[dict[str, Any]]:

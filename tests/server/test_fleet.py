@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from server_stubs import STUB_INFO
 
 from comvla.v1 import policy_pb2
+from comvla_server import fleet_page
 from comvla_server.calls import CallRecord
 from comvla_server.fleet import (
     FORGOTTEN_AFTER_S,
@@ -138,6 +141,10 @@ def test_values_that_were_made_up_are_not_repeated(fleet: Fleet) -> None:
         ("ok", True),
         ("overload", True),
         ("deadline", True),
+        ("predicted_late", True),
+        ("congested", True),
+        ("fair_share", True),
+        ("unknown_model", True),
         ("invalid", False),
         ("mismatch", False),
         ("not_owner", False),
@@ -150,6 +157,12 @@ def test_only_who_could_have_been_answered_gets_a_row(
     fleet.note(request(), call(), outcome, answer() if outcome == "ok" else None)
     assert len(fleet) == seen
     assert fleet.total.answered + fleet.total.refused == 1
+
+
+def test_the_page_has_words_for_every_reason() -> None:
+    script = (Path(fleet_page.__file__).parent / "page" / "format.js").read_text("utf-8")
+    table = script.partition("const REASONS = {")[2].partition("};")[0]
+    assert set(re.findall(r"(\w+): \"", table)) == {r.value for r in Reason} | {"ok", "repeat"}
 
 
 def test_names_that_no_session_has_get_no_row(fleet: Fleet) -> None:

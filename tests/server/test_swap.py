@@ -12,8 +12,10 @@ import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from http.client import HTTPConnection, RemoteDisconnected
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import grpc
 import httpx
@@ -29,6 +31,7 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.identity import MAY_SWAP, Identity
 from comvla_server.model_loading import Candidate
+from comvla_server.server import Server
 from comvla_server.settings import ServerSettings
 from comvla_server.tokens import TokenLine
 
@@ -346,6 +349,40 @@ def test_only_operators_may(server: BackgroundServer, loader: StubLoader) -> Non
         assert "--admin-tokens-file" in answer.json()["detail"]
 
 
+def begin_order(server: BackgroundServer, token: str, announced: int) -> HTTPConnection:
+    """An order of which the head is sent, and nothing else."""
+    connection = HTTPConnection("127.0.0.1", server.server.admin_port, timeout=PATIENCE_S)
+    connection.putrequest("POST", "/v1/models/swap")
+    connection.putheader("Authorization", f"Bearer {token}")
+    connection.putheader("Content-Type", "application/json")
+    connection.putheader("Content-Length", str(announced))
+    connection.endheaders()
+    return connection
+
+
+def test_an_order_is_not_read_before_it_is_known_who_sends_it(server: BackgroundServer) -> None:
+    for token, status in (("cvt_nobody", 401), (PROMETHEUS, 403)):
+        connection = begin_order(server, token, 10**9)
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_an_order_is_read_up_to_a_size(server: BackgroundServer) -> None:
+    assert swap(server, "a" * 20_000).status_code == 413
+    connection = begin_order(server, OPERATOR, 10**9)
+    connection.send(b" " * 20_000)
+    assert connection.getresponse().status == 413
+    connection.close()
+
+
+def test_an_order_has_to_arrive_in_time(loader: StubLoader, tokens: Path) -> None:
+    settings = ServerSettings(admin_tokens_file=tokens, request_timeout_s=0.2)
+    with BackgroundServer(lambda: loader.load("first"), settings, loader=loader) as server:
+        connection = begin_order(server, OPERATOR, 100)
+        with pytest.raises((RemoteDisconnected, ConnectionError)):
+            connection.getresponse()
+
+
 @pytest.mark.parametrize(
     "order", [{}, {"source": ""}, {"source": 3}, {"source": "again", "force": True}, [], None]
 )
@@ -372,6 +409,80 @@ def test_the_command_asks_and_tells(
     assert "nothing was replaced: 'nowhere'" in capsys.readouterr().err
     assert cli.main(["swap", "again", "--admin", "http://127.0.0.1:1", *where[2:]]) == 2
     assert "admin surface of a server at http://127.0.0.1:1" in capsys.readouterr().err
+
+
+async def test_a_replaced_model_that_is_still_asked_is_closed_with_the_server(
+    loader: StubLoader,
+) -> None:
+    settings = ServerSettings(grace_s=0.05)
+    server = Server(lambda: loader.load("first"), settings, sources={"": "first"}, loader=loader)
+    await server.start()
+    assert server._service is not None
+    (old,) = server._service.models
+    with old.users.one():
+        assert not (await server.swapper.swap("", "again")).freed
+        assert old.batcher.alive
+        await server.stop()
+        assert not old.batcher.alive
+
+
+async def test_a_bad_checkpoint_is_not_in_the_way_of_the_next(loader: StubLoader) -> None:
+    server = Server(
+        {name: Engine(answering(0.0), edge_identity="same eyes") for name in ("one", "two", "six")},
+        sources={"one": "nowhere", "two": "tuned", "six": "wider"},
+        loader=loader,
+    )
+    await server.start()
+    try:
+        replaced, troubles = await server.swapper.refresh()
+    finally:
+        await server.stop()
+    assert [report.model for report in replaced] == ["two"]
+    assert [trouble.trouble for trouble in troubles] == ["checkpoint", "robots"]
+
+
+class Impostor(BaseHTTPRequestHandler):
+    """Answers at ``/redirects`` with the way to ``/``, elsewhere with JSON that is no report."""
+
+    seen: ClassVar[list[str]] = []
+
+    def do_POST(self) -> None:
+        self.seen.append(self.path)
+        self.rfile.read(int(self.headers["content-length"]))
+        self.send_response(302 if self.path.startswith("/redirects") else 200)
+        self.send_header("location", "/")
+        self.end_headers()
+        self.wfile.write(b'{"robots": "same"}')
+
+    do_GET = do_POST
+
+    def log_message(self, *_: Any) -> None:
+        """Nothing."""
+
+
+def test_the_command_gives_the_token_to_nobody_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    token = tmp_path / "operator.token"
+    token.write_text(OPERATOR)
+
+    def asking(admin: str) -> str:
+        assert cli.main(["swap", "again", "--admin", admin, "--token-file", str(token)]) == 2
+        return capsys.readouterr().err
+
+    with HTTPServer(("127.0.0.1", 0), Impostor) as impostor:
+        thread = threading.Thread(target=impostor.serve_forever)
+        thread.start()
+        url = f"http://127.0.0.1:{impostor.server_port}"
+        try:
+            assert "nothing was replaced: 302" in asking(f"{url}/redirects")
+            assert "expected the report of a swap" in asking(f"{url}/other")
+        finally:
+            impostor.shutdown()
+            thread.join()
+    assert Impostor.seen == ["/redirects/v1/models/swap", "/other/v1/models/swap"]
+    assert "--insecure" in asking("http://192.0.2.1:8080")
+    assert "http://… or https://…" in asking("http://[")
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")

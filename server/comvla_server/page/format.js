@@ -66,6 +66,8 @@ const REASONS = {
   ok: "answering", repeat: "answering",
   malformed: "not a message of the contract", invalid: "content the model cannot take",
   conflict: "a step sent twice with other content", mismatch: "another model or protocol",
+  unknown_model: "a model not served here", predicted_late: "would have been too late",
+  congested: "turned away at the door", fair_share: "above its share",
   oversize: "message too large", overload: "server full", short: "too few tokens in time",
   key_frame: "key frame needed", superseded: "overtaken by a newer step", deadline: "too late",
   cancelled: "robot hung up", loading: "model loading", draining: "server stopping",
