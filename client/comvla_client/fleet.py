@@ -32,6 +32,7 @@ from comvla_client.roster import (
     PROBE_TIMEOUT_S,
     Member,
     Roster,
+    told,
     worst,
 )
 from comvla_client.streaming import PayloadStream
@@ -138,7 +139,7 @@ class FleetTransport:
                 error = worst(errors) if errors else self._nobody()
                 if self._closed.wait(attempts.pause_s(error)):
                     raise self._closed_error()
-                tried, errors = [], []
+                tried, errors = told(tried, errors)
                 if not self._roster.members:
                     self._look_up()
                 continue
@@ -146,8 +147,10 @@ class FleetTransport:
                 return self._ask(member, work, attempts.remaining_s(), tried)
             except TransportError as error:
                 if error.code not in ELSEWHERE:
-                    if errors and member.down:  # the clock only cut short the last attempt
-                        raise worst(errors) from error
+                    # Where the server was down already, the clock only cut short the last attempt.
+                    failure = worst([*errors, error]) if member.down else error
+                    if failure is not error:
+                        raise failure from error
                     attempts.pause_s(error)  # raises, and says why the call failed
                 tried.append(member)
                 errors.append(error)

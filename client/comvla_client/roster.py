@@ -30,6 +30,8 @@ LOOK_UP_EVERY_S = 30.0
 ELSEWHERE = frozenset({"UNAVAILABLE", "FAILED_PRECONDITION", "NOT_FOUND", "UNIMPLEMENTED"})
 """Codes of one server that say nothing of the others."""
 
+# First what waiting mends, last what it does not; whatever else was said stands between.
+_PASSES = {"UNAVAILABLE": 0, "FAILED_PRECONDITION": 3, "NOT_FOUND": 3, "UNIMPLEMENTED": 3}
 _REMEMBERED = 9
 
 
@@ -161,5 +163,21 @@ class Roster(Generic[T]):
 
 
 def worst(errors: list[TransportError]) -> TransportError:
-    """The failure to tell where every server had one: that of a server which is there, if any is."""
-    return next((error for error in errors if error.code != "UNAVAILABLE"), errors[-1])
+    """The failure to tell where every server had one: of several that which may pass soonest.
+
+    A server that is away may be back, and the right one: that the others run another model is told only where
+    all of them do.
+    """
+    return min(errors, key=lambda error: _PASSES.get(error.code, 1))
+
+
+def told(
+    tried: list[Member[T]], errors: list[TransportError]
+) -> tuple[list[Member[T]], list[TransportError]]:
+    """Those who need not be asked again in this step, since they are there and said no; with what they said."""
+    pairs = [
+        (member, error)
+        for member, error in zip(tried, errors, strict=True)
+        if error.code != "UNAVAILABLE"
+    ]
+    return [member for member, _ in pairs], [error for _, error in pairs]

@@ -21,6 +21,7 @@ from comvla_client.roster import Roster
 from comvla_client.targets import Address, Addresses, is_fleet
 
 OBS = observation()
+AWAY = ("unavailable", "deadline")
 REFUSED = "127.0.0.1:1"
 OPTIONS: dict[str, Any] = {"link": NARROW, "budget": 4, "deadline_s": 20.0}
 
@@ -112,6 +113,33 @@ def test_a_server_of_another_model_is_left_out() -> None:
         one.info = other.info
         with pytest.raises(HandshakeError, match="another model"):
             client.step(OBS, WORDS)
+
+
+def test_a_server_of_another_model_is_no_reason_to_stop_while_the_right_one_restarts() -> None:
+    with serving() as (b, other), ExitStack() as right:
+        a, _ = right.enter_context(serving())
+        with client_of(a, b, deadline_s=0.5) as client:
+            assert client.step(OBS, WORDS).source == "cloud"
+            other.info = other_model(fingerprint="0ther")
+            right.close()
+            asked = len(other.requests)
+            for _ in range(3):
+                assert client.step(OBS, WORDS).report.fallback_reason in AWAY
+            assert len(other.requests) <= asked + 3, "asked again in the same step"
+            with serving(port=int(a.rpartition(":")[2])):
+                eventually(lambda: client.step(OBS, WORDS).source == "cloud")
+
+
+async def test_the_asyncio_client_waits_for_the_right_server_too() -> None:
+    with serving() as (b, other), ExitStack() as right:
+        a, _ = right.enter_context(serving())
+        options = {**OPTIONS, "deadline_s": 0.5}
+        async with AsyncComVLAClient(f"{a},{b}", edge=StubEdge(), **options) as client:
+            other.info = other_model(fingerprint="0ther")
+            right.close()
+            for _ in range(3):
+                chunk = await client.step(OBS, WORDS)
+                assert chunk.report.fallback_reason in AWAY
 
 
 def test_all_gone_is_a_fallback_and_the_first_to_return_is_found() -> None:
