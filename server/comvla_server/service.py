@@ -152,7 +152,15 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             )
         if not watch.congested:
             return None
-        return self.runtime.batcher.glance(self._clock() + time_remaining_s)
+        # Which model the call means stands in what was not read: it may pass where any could answer it.
+        deadline_s = self._clock() + time_remaining_s
+        refusals = []
+        for runtime in self.models:
+            refusal = runtime.batcher.glance(deadline_s)
+            if refusal is None:
+                return None
+            refusals.append(refusal)
+        return min(refusals, key=lambda refusal: refusal.retry_after_s or 0.0)
 
     async def Infer(
         self, request: policy_pb2.InferRequest, context: grpc.aio.ServicerContext[Any, Any]

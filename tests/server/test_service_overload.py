@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import grpc
@@ -15,7 +16,11 @@ from server_stubs import Robot, StubCloud, eventually, message
 from comvla.load_hints import LoadHints
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
+from comvla_server.lifecycle import Lifecycle
 from comvla_server.loop_watch import LoopWatch
+from comvla_server.metrics import Metrics
+from comvla_server.refusals import Reason, Refusal
+from comvla_server.service import PolicyService
 from comvla_server.settings import ServerSettings
 from comvla_vla.request import PolicyRequest
 
@@ -199,6 +204,29 @@ def test_calls_that_die_while_the_loop_has_time_are_their_own_affair() -> None:
             watch.note(died=True)
         looks(watch, times, 1, busy=0.2)
     assert watch.looked_at == 1.0
+
+
+def test_a_glance_asks_every_model_that_a_call_may_mean() -> None:
+    service = PolicyService(Lifecycle(), Metrics(), ServerSettings())
+    service.loop_watch.late_s = 1.0
+    answers: list[Refusal | None] = []
+
+    class Queue:
+        def glance(self, deadline_s: float) -> Refusal | None:
+            return answers.pop()
+
+    class Two:
+        batcher, default = Queue(), True
+
+        def __iter__(self) -> Iterator[Two]:
+            return iter((self, self))
+
+    service.models = Two()  # type: ignore[assignment]
+    late, later = (Refusal(Reason.CONGESTED, "late", retry_after_s=s) for s in (0.1, 0.2))
+    answers[:] = [None, late]
+    assert service.glance(0.05) is None
+    answers[:] = [late, later]
+    assert service.glance(0.05) is late
 
 
 def test_a_few_robots_are_looked_at_however_slow_the_machine_is() -> None:
