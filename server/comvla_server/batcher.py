@@ -112,6 +112,11 @@ class Batcher:
         return self._load.suggested_tokens(self._clock())
 
     @property
+    def usual_s(self) -> float:
+        """Seconds that a model at rest takes for one request like those of late."""
+        return self._load.alone_s(self._load.usual_work())
+
+    @property
     def sessions(self) -> Sequence[Session]:
         """Sessions on record, least recently seen first."""
         return list(self._sessions)

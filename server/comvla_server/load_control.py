@@ -127,6 +127,10 @@ class LoadControl:
         """How long an answer took from the model to its caller; the longest ones fade slowly."""
         self._admission.lag_s = max(lag_s, _LAG_FADES * self._admission.lag_s)
 
+    def alone_s(self, work: Work) -> float:
+        """Seconds that the model takes for one request when it has nothing else to do."""
+        return self._costs.predict(work)
+
     def free_s(self, now_s: float) -> float:
         """When the model will be done with what it computes now; ``now_s`` where it rests."""
         if self._running is None:

@@ -229,6 +229,36 @@ def test_a_glance_asks_every_model_that_a_call_may_mean() -> None:
     assert service.glance(0.05) is late
 
 
+def test_one_robot_whose_calls_are_hopeless_shuts_nobody_out() -> None:
+    times = Times()
+    watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
+    for _ in range(20):
+        for i in range(50):
+            watch.note(died=True, who="arm-7", hopeless=True)
+            watch.note(died=False, who=f"robot-{i}")
+        looks(watch, times, 1, busy=0.95)
+    assert watch.looked_at == 1.0
+    for i in range(10):  # many robots at once have waited where the loop does not see it
+        watch.note(died=True, who=f"robot-{i}", hopeless=True)
+    looks(watch, times, 1, busy=0.95)
+    assert watch.looked_at < 1.0
+
+
+def test_a_call_with_less_time_than_any_answer_takes_is_hopeless(
+    server: BackgroundServer, robot: Robot
+) -> None:
+    service = server.server._service
+    assert service is not None
+    noted: list[tuple[str, bool]] = []
+    service.loop_watch.note = (  # type: ignore[method-assign]
+        lambda *, died, who="", hopeless=False: noted.append((who, hopeless))
+    )
+    service.note_lost("arm-7", 0.001)
+    service.note_lost("arm-8", 1.0)
+    service.note_lost("arm-9", None)
+    assert noted == [("arm-7", True), ("arm-8", False), ("arm-9", False)]
+
+
 def test_a_few_robots_are_looked_at_however_slow_the_machine_is() -> None:
     times = Times()
     watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
