@@ -16,9 +16,12 @@ from frozen_proxy import FrozenProxy
 
 from comvla.errors import HandshakeError
 from comvla_client import AsyncComVLAClient, ClientClosedError, ComVLAClient
+from comvla_client.errors import TransportError
 from comvla_client.fleet import FleetTransport
+from comvla_client.line import Line
 from comvla_client.roster import Roster
 from comvla_client.targets import Address, Addresses, is_fleet
+from comvla_client.transport import GrpcTransport
 
 OBS = observation()
 AWAY = ("unavailable", "deadline")
@@ -228,6 +231,15 @@ def test_closing_ends_a_step_in_another_thread() -> None:
         assert [type(error) for error in ended] == [ClientClosedError]
         with pytest.raises(ClientClosedError):
             client.step(OBS, WORDS)
+
+
+def test_a_call_over_a_closed_line_fails_at_once() -> None:
+    line = Line(GrpcTransport(REFUSED, patient=False))
+    assert line.submit(lambda: 7).result(30.0) == 7
+    line.close()
+    with pytest.raises(TransportError, match="closed") as caught:
+        line.submit(lambda: 7).result(30.0)
+    assert caught.value.code == "UNAVAILABLE"
 
 
 def test_a_fleet_of_tokens_asks_for_tls_at_every_address() -> None:
