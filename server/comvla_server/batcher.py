@@ -254,7 +254,8 @@ class Batcher:
         if isinstance(outcome, Refusal):
             raise outcome
         if remaining_s:
-            self._load.note_lag(self._clock() - max(outcome.ready_s, deadline_s - remaining_s))
+            now_s = self._clock()
+            self._load.note_lag(now_s - max(outcome.ready_s, deadline_s - remaining_s), now_s)
         return outcome
 
     async def submit(

@@ -14,8 +14,10 @@ from comvla_server.offered_load import OfferedLoad
 from comvla_server.refusals import Refusal
 from comvla_server.tickets import Place
 
-# Per answer: the longest lag has lost half its weight after 34 answers.
-_LAG_FADES = 0.98
+# Whatever held answers up is over at some time, also where nobody is let in who could show it.
+_LAG_HALF_LIFE_S = 0.5
+# A halt of the machine says little of the next answer: no more of it is expected again.
+_MOST_LAG_S = 0.25
 # A deadline is in danger where waiting uses up more than this share of its time.
 _DANGER = 0.5
 
@@ -46,6 +48,8 @@ class LoadControl:
         self._metrics = metrics
         self._busy = BusyMeter()
         self._running: tuple[float, float] | None = None
+        self._lag_s = 0.0
+        self._lagged_s = 0.0
 
     def order(self, waiting: Sequence[Place]) -> list[Place]:
         """Who is computed first."""
@@ -65,6 +69,7 @@ class LoadControl:
         Raises:
             Refusal: it would be late, make another late, or is above its fair share.
         """
+        self._admission.lag_s = self.lag_s(now_s)
         try:
             return self._admission.require(
                 place,
@@ -123,9 +128,14 @@ class LoadControl:
         if succeeded:
             self._costs.observe(work, now_s - ready_s)
 
-    def note_lag(self, lag_s: float) -> None:
-        """How long an answer took from the model to its caller; the longest ones fade slowly."""
-        self._admission.lag_s = max(lag_s, _LAG_FADES * self._admission.lag_s)
+    def note_lag(self, lag_s: float, now_s: float) -> None:
+        """How long an answer took from the model to its caller."""
+        self._lag_s = max(min(lag_s, _MOST_LAG_S), self.lag_s(now_s))
+        self._lagged_s = now_s
+
+    def lag_s(self, now_s: float) -> float:
+        """The longest such time of late, in seconds; it fades."""
+        return self._lag_s * 0.5 ** max(0.0, (now_s - self._lagged_s) / _LAG_HALF_LIFE_S)
 
     def alone_s(self, work: Work) -> float:
         """Seconds that the model takes for one request when it has nothing else to do."""
