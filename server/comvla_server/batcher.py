@@ -163,7 +163,7 @@ class Batcher:
         place = Place("", work, deadline_s, deadline_s)
         waiting = [s.queued.place for s in self._queue.values() if s.queued]
         try:
-            self._load.screen(place, waiting, now_s, replaces=True)
+            self._load.predict(place, waiting, now_s, replaces=True)
         except Refusal as late:
             refusal = Refusal(Reason.CONGESTED, late.message, retry_after_s=late.retry_after_s)
             refusal.suggested_tokens = self._load.suggested_tokens(now_s)

@@ -55,10 +55,10 @@ class LoadControl:
         """Who is computed first."""
         return self._admission.order(waiting)
 
-    def screen(
+    def predict(
         self, place: Place, waiting: Sequence[Place], now_s: float, *, replaces: bool
     ) -> float:
-        """Predicted seconds until a request's answer; counts nothing but a refusal.
+        """Predicted seconds until a request's answer; counts nothing at all.
 
         Args:
             place: of the new request.
@@ -70,18 +70,30 @@ class LoadControl:
             Refusal: it would be late, make another late, or is above its fair share.
         """
         self._admission.lag_s = self.lag_s(now_s)
+        return self._admission.require(
+            place,
+            waiting,
+            self.free_s(now_s),
+            now_s,
+            overloaded=self.load(now_s) > 1.0,
+            replaces=replaces,
+        )
+
+    def screen(
+        self, place: Place, waiting: Sequence[Place], now_s: float, *, replaces: bool
+    ) -> float:
+        """:meth:`predict`, and counts a refusal, unless the model at rest would be too slow as well.
+
+        Raises:
+            Refusal: see :meth:`predict`.
+        """
         try:
-            return self._admission.require(
-                place,
-                waiting,
-                self.free_s(now_s),
-                now_s,
-                overloaded=self.load(now_s) > 1.0,
-                replaces=replaces,
-            )
+            return self.predict(place, waiting, now_s, replaces=replaces)
         except Refusal:
-            self._note_asked(place, now_s)
-            self._offered.note_pressure(now_s)
+            # What could never be answered takes none of the model's time, however often it is asked.
+            if place.deadline_s - now_s >= self.alone_s(place.work):
+                self._note_asked(place, now_s)
+                self._offered.note_pressure(now_s)
             raise
 
     def let_in(

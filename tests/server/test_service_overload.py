@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import grpc
@@ -15,7 +15,7 @@ from server_stubs import Robot, StubCloud, eventually, message
 
 from comvla.load_hints import LoadHints
 from comvla_server.background import BackgroundServer
-from comvla_server.cost_model import CostModel
+from comvla_server.cost_model import CostModel, Work
 from comvla_server.engine import Engine
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.load_control import LoadControl
@@ -25,6 +25,7 @@ from comvla_server.metrics import Metrics
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.service import PolicyService
 from comvla_server.settings import ServerSettings
+from comvla_server.tickets import Place
 from comvla_vla.request import PolicyRequest
 
 
@@ -270,6 +271,23 @@ def test_the_lag_of_answers_fades_with_time_and_a_halt_is_not_expected_again() -
     control.note_lag(0.001, 101.0)
     assert control.lag_s(101.0) == pytest.approx(0.0625)
     assert control.lag_s(110.0) < 0.001
+
+
+def test_what_could_never_be_answered_and_what_was_not_read_is_no_load() -> None:
+    costs = CostModel()
+    costs.observe(Work(1, 10), 0.1)
+    control = LoadControl(8, 512, LoadPolicy(), costs, Metrics())
+    control.begin(Work(1, 10), 10.0)
+
+    def refused(ask: Callable[..., object], had_s: float) -> float:
+        place = Place("arm-7", Work(1, 10), 10.0 + had_s, 10.0 + had_s)
+        with pytest.raises(Refusal):
+            ask(place, [], 10.0, replaces=False)
+        return control.load(10.0)
+
+    assert refused(control.screen, 0.001) == 0.0
+    assert refused(control.predict, 0.15) == 0.0
+    assert refused(control.screen, 0.15) > 0.0
 
 
 def test_a_few_robots_are_looked_at_however_slow_the_machine_is() -> None:
