@@ -1,7 +1,7 @@
 """Calls to several servers that answer alike, in turns; who fails is left out until it is well again.
 
 A step stands alone, so any server can answer it, and a repeat of it as well. Where one says that it
-cannot (it is gone, drains, runs another model), the next is asked at once. Where one is silent for much
+cannot (it is gone, drains, runs another model, is busy), the next is asked at once. Where one is silent for much
 longer than usual, it is asked over a new connection whether it is well, and others too: if another
 says so and it does not, the step is sent to that one as well, and the first answer counts. Only then is
 a payload sent twice: where the link is what is slow, both would only make it slower.
