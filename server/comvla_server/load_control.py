@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from comvla_server.admission import Admission
@@ -147,7 +148,8 @@ class LoadControl:
 
     def lag_s(self, now_s: float) -> float:
         """The longest such time of late, in seconds; it fades."""
-        return self._lag_s * 0.5 ** max(0.0, (now_s - self._lagged_s) / _LAG_HALF_LIFE_S)
+        halvings = max(0.0, (now_s - self._lagged_s) / _LAG_HALF_LIFE_S)
+        return self._lag_s * math.pow(0.5, halvings)
 
     def alone_s(self, work: Work) -> float:
         """Seconds that the model takes for one request when it has nothing else to do."""

@@ -296,8 +296,8 @@ def test_a_robot_that_hangs_up_costs_no_compute(
 
 def test_the_end_of_a_window_is_no_death(robot: Robot, server: BackgroundServer) -> None:
     assert server.server._access is not None
-    lost: list[str] = []
-    server.server._access.door.on_lost = lambda who, time_remaining_s: lost.append(who)
+    lost: list[object] = []
+    server.server._access.door.on_lost = lambda *call: lost.append(call)
     request = message(k=6)
     sent = [opening(request, window_s=SOON_S), *pieces(request.payload, token_ends(6)[:3])]
     assert answered(robot, Uplink(sent, close=False)).tokens_used == 3
