@@ -345,7 +345,7 @@ class ClientCore:
         detail = prepared.plan.detail if error is None else error.message
         actions, planned, source = self.queue.fall_back(hold=prepared.plan.hold)
         report = replace(
-            self._closed(prepared, call_s),
+            self._closed(prepared, call_s, refused=reason == "overloaded"),
             source=source,
             fallback_reason=reason,
             detail=detail,
@@ -442,7 +442,9 @@ class ClientCore:
         rate = None if plan.cap_bits is None else plan.cap_bits / 8.0 / window_s
         return PayloadStream(request, payload, ends, window_s, plan.min_tokens, rate)
 
-    def _closed(self, prepared: Prepared, call_s: float, arrived: int = 0) -> StepReport:
+    def _closed(
+        self, prepared: Prepared, call_s: float, arrived: int = 0, *, refused: bool = False
+    ) -> StepReport:
         """The report with its times and with what crossed; the policy learns from it."""
         report, uplink, stream = prepared.report, prepared.uplink, prepared.stream
         timings_s = report.timings_s | {
@@ -477,8 +479,8 @@ class ClientCore:
             arrived_bits = 8.0 * self._payload_bytes(arrived)
         else:  # pictures arrive whole or not at all
             arrived_bits = 8.0 * report.payload_bytes if arrived else 0.0
-        if prepared.reason == "overloaded":
-            return report  # nothing was tried, so nothing is known of the link
+        if refused:
+            return report  # turned away or not tried at all: neither says anything of the link
         self.sending.learn(
             Outcome(
                 offered_tokens=offered,

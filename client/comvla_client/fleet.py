@@ -1,7 +1,7 @@
 """Calls to several servers that answer alike, in turns; who fails is left out until it is well again.
 
 A step stands alone, so any server can answer it, and a repeat of it as well. Where one says that it
-cannot (it is gone, drains, runs another model), the next is asked at once. Where one is silent for much
+cannot (it is gone, drains, runs another model, is busy), the next is asked at once. Where one is silent for much
 longer than usual, it is asked over a new connection whether it is well, and others too: if another
 says so and it does not, the step is sent to that one as well, and the first answer counts. Only then is
 a payload sent twice: where the link is what is slow, both would only make it slower.
@@ -32,6 +32,7 @@ from comvla_client.roster import (
     PROBE_TIMEOUT_S,
     Member,
     Roster,
+    told,
     worst,
 )
 from comvla_client.streaming import PayloadStream
@@ -138,7 +139,7 @@ class FleetTransport:
                 error = worst(errors) if errors else self._nobody()
                 if self._closed.wait(attempts.pause_s(error)):
                     raise self._closed_error()
-                tried, errors = [], []
+                tried, errors = told(tried, errors)
                 if not self._roster.members:
                     self._look_up()
                 continue
@@ -146,8 +147,10 @@ class FleetTransport:
                 return self._ask(member, work, attempts.remaining_s(), tried)
             except TransportError as error:
                 if error.code not in ELSEWHERE:
-                    if errors and member.down:  # the clock only cut short the last attempt
-                        raise worst(errors) from error
+                    # Where the server was down already, the clock only cut short the last attempt.
+                    failure = worst([*errors, error]) if member.down else error
+                    if failure is not error:
+                        raise failure from error
                     attempts.pause_s(error)  # raises, and says why the call failed
                 tried.append(member)
                 errors.append(error)

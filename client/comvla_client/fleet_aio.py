@@ -21,6 +21,7 @@ from comvla_client.roster import (
     PROBE_TIMEOUT_S,
     Member,
     Roster,
+    told,
     worst,
 )
 from comvla_client.streaming import PayloadStream
@@ -131,7 +132,7 @@ class FleetAioTransport:
             if member is None:
                 error = worst(errors) if errors else self._nobody()
                 await asyncio.sleep(attempts.pause_s(error))
-                tried, errors = [], []
+                tried, errors = told(tried, errors)
                 if not self._roster.members:
                     await self._look_up()
                 continue
@@ -139,8 +140,10 @@ class FleetAioTransport:
                 return await self._ask(member, work, attempts.remaining_s(), tried)
             except TransportError as error:
                 if error.code not in ELSEWHERE:
-                    if errors and member.down:  # the clock only cut short the last attempt
-                        raise worst(errors) from error
+                    # Where the server was down already, the clock only cut short the last attempt.
+                    failure = worst([*errors, error]) if member.down else error
+                    if failure is not error:
+                        raise failure from error
                     attempts.pause_s(error)  # raises, and says why the call failed
                 tried.append(member)
                 errors.append(error)

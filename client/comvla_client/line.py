@@ -24,17 +24,26 @@ class Line:
         self._lock = threading.Lock()
         self._threads = 0
         self._idle = 0
+        self._closed = False
 
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
-        """Makes a call as soon as a thread is free; another thread where none is."""
+        """Makes a call as soon as a thread is free; another thread where none is.
+
+        Once the line is closed the call fails at once with UNAVAILABLE.
+        """
         future: Future[Any] = Future()
         with self._lock:
+            if self._closed:
+                future.set_exception(
+                    TransportError("UNAVAILABLE", "the connection to this server was closed")
+                )
+                return future
             if self._idle > 0:
                 self._idle -= 1
             else:
                 threading.Thread(target=self._work, name="comvla-line", daemon=True).start()
                 self._threads += 1
-        self._jobs.put((future, call))
+            self._jobs.put((future, call))  # before close can tell the threads to end
         return future
 
     def is_well(self) -> bool:
@@ -48,6 +57,7 @@ class Line:
         """Ends calls under way and frees the connection."""
         self.transport.close()
         with self._lock:
+            self._closed = True
             for _ in range(self._threads):
                 self._jobs.put(None)
             self._threads = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import statistics
 import threading
@@ -27,9 +28,14 @@ FOREIGN_FOR_S = 30.0
 LOOK_UP_EVERY_S = 30.0
 """How often a name is looked up again while all is well."""
 
-ELSEWHERE = frozenset({"UNAVAILABLE", "FAILED_PRECONDITION", "NOT_FOUND", "UNIMPLEMENTED"})
+BUSY = "RESOURCE_EXHAUSTED"
+"""The code of a server that has no time, or not for this robot."""
+
+ELSEWHERE = frozenset({"UNAVAILABLE", "FAILED_PRECONDITION", "NOT_FOUND", "UNIMPLEMENTED", BUSY})
 """Codes of one server that say nothing of the others."""
 
+# First what waiting mends, last what it does not; whatever else was said stands between.
+_PASSES = {"UNAVAILABLE": 0, BUSY: 2, "FAILED_PRECONDITION": 3, "NOT_FOUND": 3, "UNIMPLEMENTED": 3}
 _REMEMBERED = 9
 
 
@@ -146,8 +152,8 @@ class Roster(Generic[T]):
 
     def failed(self, member: Member[T], error: TransportError) -> None:
         """A call was not, and that says something of the server."""
-        if error.code not in ELSEWHERE:
-            return
+        if error.code not in ELSEWHERE or error.code == BUSY:
+            return  # who is busy is well
         pause_s = 0.0 if error.code == "UNAVAILABLE" else FOREIGN_FOR_S
         self.leave(member, pause_s)
 
@@ -161,5 +167,26 @@ class Roster(Generic[T]):
 
 
 def worst(errors: list[TransportError]) -> TransportError:
-    """The failure to tell where every server had one: that of a server which is there, if any is."""
-    return next((error for error in errors if error.code != "UNAVAILABLE"), errors[-1])
+    """The failure to tell where every server had one: of several that which may pass soonest.
+
+    A server that is away may be back, and the right one: that the others run another model is told only where
+    all of them do, and that they are busy where nobody else is left: of those, who has time first.
+    """
+
+    def passes(error: TransportError) -> tuple[int, float]:
+        retry_s = error.hints.retry_after_s
+        return _PASSES.get(error.code, 1), math.inf if retry_s is None else retry_s
+
+    return min(errors, key=passes)
+
+
+def told(
+    tried: list[Member[T]], errors: list[TransportError]
+) -> tuple[list[Member[T]], list[TransportError]]:
+    """Those who need not be asked again in this step, since they are there and said no; with what they said."""
+    pairs = [
+        (member, error)
+        for member, error in zip(tried, errors, strict=True)
+        if error.code != "UNAVAILABLE"
+    ]
+    return [member for member, _ in pairs], [error for _, error in pairs]

@@ -112,6 +112,11 @@ class Batcher:
         return self._load.suggested_tokens(self._clock())
 
     @property
+    def usual_s(self) -> float:
+        """Seconds that a model at rest takes for one request like those of late."""
+        return self._load.alone_s(self._load.usual_work())
+
+    @property
     def sessions(self) -> Sequence[Session]:
         """Sessions on record, least recently seen first."""
         return list(self._sessions)
@@ -158,7 +163,7 @@ class Batcher:
         place = Place("", work, deadline_s, deadline_s)
         waiting = [s.queued.place for s in self._queue.values() if s.queued]
         try:
-            self._load.screen(place, waiting, now_s, replaces=True)
+            self._load.predict(place, waiting, now_s, replaces=True)
         except Refusal as late:
             refusal = Refusal(Reason.CONGESTED, late.message, retry_after_s=late.retry_after_s)
             refusal.suggested_tokens = self._load.suggested_tokens(now_s)
@@ -249,7 +254,8 @@ class Batcher:
         if isinstance(outcome, Refusal):
             raise outcome
         if remaining_s:
-            self._load.note_lag(self._clock() - max(outcome.ready_s, deadline_s - remaining_s))
+            now_s = self._clock()
+            self._load.note_lag(now_s - max(outcome.ready_s, deadline_s - remaining_s), now_s)
         return outcome
 
     async def submit(

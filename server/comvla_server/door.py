@@ -67,7 +67,8 @@ class Door(grpc.aio.ServerInterceptor):
     Attributes:
         glance: asked before a call for actions is looked at, with the seconds that it has: a refusal where it would
             be read in vain.
-        on_lost: told of each call that ended while it was read.
+        on_lost: told of each call with a single request that ended while it was read: whose it was, and the seconds
+            that it had.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class Door(grpc.aio.ServerInterceptor):
         self._metrics = metrics
         self._throttle = LogThrottle(time.monotonic)
         self._guards: dict[str, tuple[Any, Any]] = {}
-        self.on_lost: Callable[[], None] = lambda: None
+        self.on_lost: Callable[[str, float | None], None] = lambda who, time_remaining_s: None
         self.glance: Callable[[float | None], Refusal | None] = lambda time_remaining_s: None
 
     async def intercept_service(
@@ -177,9 +178,6 @@ class Door(grpc.aio.ServerInterceptor):
             message = await _within(anext(requests), self._timeout_s)
         except StopAsyncIteration:
             return None
-        except asyncio.CancelledError:
-            self.on_lost()
-            raise
         except asyncio.TimeoutError:
             raise Refusal(
                 Reason.SLOW,
@@ -243,7 +241,13 @@ class _Entry:
             messages = aiter(requests)
             if self._streams:
                 return self._stream(messages, identity)
-            message = await self._door.read(messages, identity)
+            time_remaining_s = context.time_remaining()
+            try:
+                message = await self._door.read(messages, identity)
+            except asyncio.CancelledError:
+                # Of a stream the service itself tells, which also ends reading where a window ends.
+                self._door.on_lost(identity.name or context.peer(), time_remaining_s)
+                raise
         except Refusal as refusal:
             await self.refuse(refusal, context)
         if message is None and _given_up(context):

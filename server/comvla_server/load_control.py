@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from comvla_server.admission import Admission
@@ -14,8 +15,10 @@ from comvla_server.offered_load import OfferedLoad
 from comvla_server.refusals import Refusal
 from comvla_server.tickets import Place
 
-# Per answer: the longest lag has lost half its weight after 34 answers.
-_LAG_FADES = 0.98
+# Whatever held answers up is over at some time, also where nobody is let in who could show it.
+_LAG_HALF_LIFE_S = 0.5
+# A halt of the machine says little of the next answer: no more of it is expected again.
+_MOST_LAG_S = 0.25
 # A deadline is in danger where waiting uses up more than this share of its time.
 _DANGER = 0.5
 
@@ -46,15 +49,17 @@ class LoadControl:
         self._metrics = metrics
         self._busy = BusyMeter()
         self._running: tuple[float, float] | None = None
+        self._lag_s = 0.0
+        self._lagged_s = 0.0
 
     def order(self, waiting: Sequence[Place]) -> list[Place]:
         """Who is computed first."""
         return self._admission.order(waiting)
 
-    def screen(
+    def predict(
         self, place: Place, waiting: Sequence[Place], now_s: float, *, replaces: bool
     ) -> float:
-        """Predicted seconds until a request's answer; counts nothing but a refusal.
+        """Predicted seconds until a request's answer; counts nothing at all.
 
         Args:
             place: of the new request.
@@ -65,18 +70,31 @@ class LoadControl:
         Raises:
             Refusal: it would be late, make another late, or is above its fair share.
         """
+        self._admission.lag_s = self.lag_s(now_s)
+        return self._admission.require(
+            place,
+            waiting,
+            self.free_s(now_s),
+            now_s,
+            overloaded=self.load(now_s) > 1.0,
+            replaces=replaces,
+        )
+
+    def screen(
+        self, place: Place, waiting: Sequence[Place], now_s: float, *, replaces: bool
+    ) -> float:
+        """:meth:`predict`, and counts a refusal, unless the model at rest would be too slow as well.
+
+        Raises:
+            Refusal: see :meth:`predict`.
+        """
         try:
-            return self._admission.require(
-                place,
-                waiting,
-                self.free_s(now_s),
-                now_s,
-                overloaded=self.load(now_s) > 1.0,
-                replaces=replaces,
-            )
+            return self.predict(place, waiting, now_s, replaces=replaces)
         except Refusal:
-            self._note_asked(place, now_s)
-            self._offered.note_pressure(now_s)
+            # What could never be answered takes none of the model's time, however often it is asked.
+            if place.deadline_s - now_s >= self.alone_s(place.work):
+                self._note_asked(place, now_s)
+                self._offered.note_pressure(now_s)
             raise
 
     def let_in(
@@ -123,9 +141,19 @@ class LoadControl:
         if succeeded:
             self._costs.observe(work, now_s - ready_s)
 
-    def note_lag(self, lag_s: float) -> None:
-        """How long an answer took from the model to its caller; the longest ones fade slowly."""
-        self._admission.lag_s = max(lag_s, _LAG_FADES * self._admission.lag_s)
+    def note_lag(self, lag_s: float, now_s: float) -> None:
+        """How long an answer took from the model to its caller."""
+        self._lag_s = max(min(lag_s, _MOST_LAG_S), self.lag_s(now_s))
+        self._lagged_s = now_s
+
+    def lag_s(self, now_s: float) -> float:
+        """The longest such time of late, in seconds; it fades."""
+        halvings = max(0.0, (now_s - self._lagged_s) / _LAG_HALF_LIFE_S)
+        return self._lag_s * math.pow(0.5, halvings)
+
+    def alone_s(self, work: Work) -> float:
+        """Seconds that the model takes for one request when it has nothing else to do."""
+        return self._costs.predict(work)
 
     def free_s(self, now_s: float) -> float:
         """When the model will be done with what it computes now; ``now_s`` where it rests."""

@@ -25,6 +25,8 @@ class LoopWatch:
     Where calls then die on their way through the server, it takes on more than it can do, whatever the model could:
     fewer of them are looked at, a fifth fewer at each look, until the others live; then slowly more again.
     Where few calls come, it is not they who keep the loop from its work, and all are looked at.
+    Calls that came with too little time for any answer die wherever they go. Those of many callers have waited before
+    they were seen, and count once for each caller but one: one robot whose calls are hopeless shuts nobody out.
 
     Args:
         clock: monotonic seconds.
@@ -46,6 +48,7 @@ class LoopWatch:
         self._processor = processor
         self._draw = draw
         self._lived = self._died = 0
+        self._hopeless: set[str] = set()
         self.looked_at = 1.0
         self._last: tuple[float, float] | None = None
         self.busy = 0.0
@@ -56,10 +59,19 @@ class LoopWatch:
         """Whether calls may be waiting that the loop has not seen yet."""
         return self.busy > _BUSY or self.late_s > _LATE_S
 
-    def note(self, *, died: bool) -> None:
-        """A call left the server: it died of its deadline, or it did not."""
-        self._died += died
-        self._lived += not died
+    def note(self, *, died: bool, who: str = "", hopeless: bool = False) -> None:
+        """A call left the server.
+
+        Args:
+            died: of its deadline.
+            who: made it.
+            hopeless: it came with too little time for an answer.
+        """
+        if died and hopeless:
+            self._hopeless.add(who)
+        else:
+            self._died += died
+            self._lived += not died
 
     def skips(self) -> bool:
         """Whether the next call is one of those that are not looked at."""
@@ -88,9 +100,11 @@ class LoopWatch:
             self.busy += (1.0 - _MEMORY) * (busy - self.busy)
             self.late_s += (1.0 - _MEMORY) * (late_s - self.late_s)
         self._last = now_s, worked_s
-        calls = self._died + self._lived
-        if self.congested and calls >= _LEAST_CALLS and self._died > _DEATHS * calls:
+        died = self._died + max(0, len(self._hopeless) - 1)
+        calls = died + self._lived
+        if self.congested and calls >= _LEAST_CALLS and died > _DEATHS * calls:
             self.looked_at = max(_LEAST_LOOKED_AT, 0.8 * self.looked_at)
         else:
             self.looked_at = min(1.0, self.looked_at + 0.02)
         self._lived = self._died = 0
+        self._hopeless.clear()

@@ -128,7 +128,7 @@ class Server:
         server = make_grpc_server(settings, [access.door])
         service = PolicyService(self.lifecycle, self.metrics, settings, tracing=self._tracing)
         access.door.glance = service.glance
-        access.door.on_lost = lambda: service.loop_watch.note(died=True)
+        access.door.on_lost = service.note_lost
         add_policy_service(server, service)
         await self._health.register(server)
         admin_socket = listen(settings.admin_address, settings.admin_port, "--admin-port")

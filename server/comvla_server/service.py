@@ -20,6 +20,7 @@ from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.accounts import Answered, CallAccounts
 from comvla_server.calls import CallRecord, this_call
 from comvla_server.fleet import Fleet
+from comvla_server.identity import caller
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.loop_watch import LoopWatch
 from comvla_server.memory import BytesInFlight, Lease
@@ -33,6 +34,9 @@ from comvla_server.tracing import Tracing, current_trace
 from comvla_server.validation import content_digest
 from comvla_server.version import server_version
 from comvla_vla.request import AnyRequest
+
+_LEAST_TIME_S = 0.02
+"""Whoever arrives with less cannot count on an answer, whatever the model."""
 
 STATUS = {
     Reason.MALFORMED: grpc.StatusCode.INVALID_ARGUMENT,
@@ -152,7 +156,15 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             )
         if not watch.congested:
             return None
-        return self.runtime.batcher.glance(self._clock() + time_remaining_s)
+        # Which model the call means stands in what was not read: it may pass where any could answer it.
+        deadline_s = self._clock() + time_remaining_s
+        refusals = []
+        for runtime in self.models:
+            refusal = runtime.batcher.glance(deadline_s)
+            if refusal is None:
+                return None
+            refusals.append(refusal)
+        return min(refusals, key=lambda refusal: refusal.retry_after_s or 0.0)
 
     async def Infer(
         self, request: policy_pb2.InferRequest, context: grpc.aio.ServicerContext[Any, Any]
@@ -197,7 +209,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 with self._using(runtime):
                     return await self._answer(runtime, request, lease, started_s, deadline_s)
 
-        return await self._watched(self._accounts.run(request, time_remaining_s, work))
+        answer = self._accounts.run(request, time_remaining_s, work)
+        return await self._watched(answer, request, time_remaining_s)
 
     async def infer_progressive(
         self, messages: AsyncIterator[Any], time_remaining_s: float | None
@@ -220,10 +233,14 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             with self._in_flight.lease() as lease:
                 return await self._answer_stream(request, messages, lease, started_s, deadline_s)
 
-        return await self._watched(self._accounts.run(request, time_remaining_s, work))
+        answer = self._accounts.run(request, time_remaining_s, work)
+        return await self._watched(answer, request, time_remaining_s)
 
     async def _watched(
-        self, answer: Awaitable[policy_pb2.InferResponse]
+        self,
+        answer: Awaitable[policy_pb2.InferResponse],
+        request: policy_pb2.InferRequest,
+        time_remaining_s: float | None,
     ) -> policy_pb2.InferResponse:
         """Tells the loop's watch what became of a call."""
         died = False
@@ -236,7 +253,25 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             died = refusal.reason is Reason.DEADLINE
             raise
         finally:
-            self.loop_watch.note(died=died)
+            if died:
+                self.note_lost(caller().name or request.session_id, time_remaining_s)
+            else:
+                self.loop_watch.note(died=False)
+
+    def note_lost(self, who: str, time_remaining_s: float | None) -> None:
+        """Tells the loop's watch of a call that died on its way.
+
+        Args:
+            who: made it.
+            time_remaining_s: seconds that it had when it was first seen, None where it did not say.
+        """
+        hopeless = time_remaining_s is not None and time_remaining_s < self._least_time_s()
+        self.loop_watch.note(died=True, who=who, hopeless=hopeless)
+
+    def _least_time_s(self) -> float:
+        """Seconds in which no model can be expected to answer, however idle."""
+        usual_s = min((runtime.batcher.usual_s for runtime in self.models), default=0.0)
+        return max(_LEAST_TIME_S, usual_s)
 
     def _traced(
         self, method: str, context: grpc.aio.ServicerContext[Any, Any]

@@ -10,17 +10,33 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+import grpc
 import pytest
-from client_stubs import NARROW, WORDS, StubEdge, StubService, observation, other_model, serving
+from client_stubs import (
+    NARROW,
+    WORDS,
+    StubEdge,
+    StubService,
+    fault,
+    observation,
+    other_model,
+    serving,
+)
 from frozen_proxy import FrozenProxy
 
 from comvla.errors import HandshakeError
+from comvla.load_hints import LoadHints
+from comvla.v1.policy_pb2 import InferRequest
 from comvla_client import AsyncComVLAClient, ClientClosedError, ComVLAClient
+from comvla_client.errors import TransportError
 from comvla_client.fleet import FleetTransport
-from comvla_client.roster import Roster
+from comvla_client.line import Line
+from comvla_client.roster import Roster, worst
 from comvla_client.targets import Address, Addresses, is_fleet
+from comvla_client.transport import GrpcTransport
 
 OBS = observation()
+AWAY = ("unavailable", "deadline")
 REFUSED = "127.0.0.1:1"
 OPTIONS: dict[str, Any] = {"link": NARROW, "budget": 4, "deadline_s": 20.0}
 
@@ -114,6 +130,67 @@ def test_a_server_of_another_model_is_left_out() -> None:
             client.step(OBS, WORDS)
 
 
+def test_a_server_of_another_model_is_no_reason_to_stop_while_the_right_one_restarts() -> None:
+    with serving() as (b, other), ExitStack() as right:
+        a, _ = right.enter_context(serving())
+        with client_of(a, b, deadline_s=0.5) as client:
+            assert client.step(OBS, WORDS).source == "cloud"
+            other.info = other_model(fingerprint="0ther")
+            right.close()
+            asked = len(other.requests)
+            for _ in range(3):
+                assert client.step(OBS, WORDS).report.fallback_reason in AWAY
+            assert len(other.requests) <= asked + 3, "asked again in the same step"
+            with serving(port=int(a.rpartition(":")[2])):
+                eventually(lambda: client.step(OBS, WORDS).source == "cloud")
+
+
+async def test_the_asyncio_client_waits_for_the_right_server_too() -> None:
+    with serving() as (b, other), ExitStack() as right:
+        a, _ = right.enter_context(serving())
+        options = {**OPTIONS, "deadline_s": 0.5}
+        async with AsyncComVLAClient(f"{a},{b}", edge=StubEdge(), **options) as client:
+            other.info = other_model(fingerprint="0ther")
+            right.close()
+            for _ in range(3):
+                chunk = await client.step(OBS, WORDS)
+                assert chunk.report.fallback_reason in AWAY
+
+
+def too_busy(request: InferRequest, context: grpc.ServicerContext) -> None:
+    context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too much is asked")
+
+
+def test_a_busy_server_does_not_silence_the_robot_towards_the_others() -> None:
+    with two_servers() as ((a, one), (b, other)), client_of(a, b, execute=8) as client:
+        assert all(client.step(OBS, WORDS).source == "cloud" for _ in range(2))
+        one.before = too_busy
+        assert all(client.step(OBS, WORDS).source == "cloud" for _ in range(6))
+        other.before = too_busy
+        asked = len(one.requests), len(other.requests)
+        refused, waits = (client.step(OBS, WORDS).report for _ in range(2))
+        assert (len(one.requests), len(other.requests)) == (asked[0] + 1, asked[1] + 1)
+    assert refused.fallback_reason == waits.fallback_reason == "overloaded"
+    assert refused.detail == "too much is asked"
+    assert "asking again in" in waits.detail
+
+
+async def test_the_asyncio_client_asks_another_server_where_one_is_busy() -> None:
+    with two_servers() as ((a, one), (b, _)):
+        one.before = too_busy
+        async with AsyncComVLAClient(f"{a},{b}", edge=StubEdge(), **OPTIONS) as client:
+            for _ in range(6):
+                assert (await client.step(OBS, WORDS)).source == "cloud"
+
+
+def test_what_is_told_of_several_servers_is_what_may_pass_soonest() -> None:
+    gone, foreign = fault("UNAVAILABLE"), fault("FAILED_PRECONDITION")
+    busy, later = (fault("RESOURCE_EXHAUSTED", hints=LoadHints(s, 0)) for s in (0.1, 0.2))
+    assert worst([foreign, busy, gone]) is gone
+    assert worst([foreign, later, busy]) is busy
+    assert worst([foreign, foreign]) is foreign
+
+
 def test_all_gone_is_a_fallback_and_the_first_to_return_is_found() -> None:
     with ExitStack() as servers:
         (a, _), (b, _) = (servers.enter_context(serving()) for _ in range(2))
@@ -200,6 +277,15 @@ def test_closing_ends_a_step_in_another_thread() -> None:
         assert [type(error) for error in ended] == [ClientClosedError]
         with pytest.raises(ClientClosedError):
             client.step(OBS, WORDS)
+
+
+def test_a_call_over_a_closed_line_fails_at_once() -> None:
+    line = Line(GrpcTransport(REFUSED, patient=False))
+    assert line.submit(lambda: 7).result(30.0) == 7
+    line.close()
+    with pytest.raises(TransportError, match="closed") as caught:
+        line.submit(lambda: 7).result(30.0)
+    assert caught.value.code == "UNAVAILABLE"
 
 
 def test_a_fleet_of_tokens_asks_for_tls_at_every_address() -> None:

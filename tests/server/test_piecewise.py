@@ -294,6 +294,16 @@ def test_a_robot_that_hangs_up_costs_no_compute(
     assert cloud.batches == []
 
 
+def test_the_end_of_a_window_is_no_death(robot: Robot, server: BackgroundServer) -> None:
+    assert server.server._access is not None
+    lost: list[object] = []
+    server.server._access.door.on_lost = lambda *call: lost.append(call)
+    request = message(k=6)
+    sent = [opening(request, window_s=SOON_S), *pieces(request.payload, token_ends(6)[:3])]
+    assert answered(robot, Uplink(sent, close=False)).tokens_used == 3
+    assert lost == []
+
+
 def test_streams_are_counted_like_the_calls_that_they_are(
     robot: Robot, server: BackgroundServer
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import grpc
@@ -14,9 +15,17 @@ from server_stubs import Robot, StubCloud, eventually, message
 
 from comvla.load_hints import LoadHints
 from comvla_server.background import BackgroundServer
+from comvla_server.cost_model import CostModel, Work
 from comvla_server.engine import Engine
+from comvla_server.lifecycle import Lifecycle
+from comvla_server.load_control import LoadControl
+from comvla_server.load_policy import LoadPolicy
 from comvla_server.loop_watch import LoopWatch
+from comvla_server.metrics import Metrics
+from comvla_server.refusals import Reason, Refusal
+from comvla_server.service import PolicyService
 from comvla_server.settings import ServerSettings
+from comvla_server.tickets import Place
 from comvla_vla.request import PolicyRequest
 
 
@@ -199,6 +208,86 @@ def test_calls_that_die_while_the_loop_has_time_are_their_own_affair() -> None:
             watch.note(died=True)
         looks(watch, times, 1, busy=0.2)
     assert watch.looked_at == 1.0
+
+
+def test_one_robot_whose_calls_are_hopeless_shuts_nobody_out() -> None:
+    times = Times()
+    watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
+    for _ in range(20):
+        for i in range(50):
+            watch.note(died=True, who="arm-7", hopeless=True)
+            watch.note(died=False, who=f"robot-{i}")
+        looks(watch, times, 1, busy=0.95)
+    assert watch.looked_at == 1.0
+    for i in range(10):  # many robots at once have waited where the loop does not see it
+        watch.note(died=True, who=f"robot-{i}", hopeless=True)
+    looks(watch, times, 1, busy=0.95)
+    assert watch.looked_at < 1.0
+
+
+def test_a_call_with_less_time_than_any_answer_takes_is_hopeless(
+    server: BackgroundServer, robot: Robot
+) -> None:
+    service = server.server._service
+    assert service is not None
+    noted: list[tuple[str, bool]] = []
+    service.loop_watch.note = (  # type: ignore[method-assign]
+        lambda *, died, who="", hopeless=False: noted.append((who, hopeless))
+    )
+    service.note_lost("arm-7", 0.001)
+    service.note_lost("arm-8", 1.0)
+    service.note_lost("arm-9", None)
+    assert noted == [("arm-7", True), ("arm-8", False), ("arm-9", False)]
+
+
+def test_a_glance_asks_every_model_that_a_call_may_mean() -> None:
+    service = PolicyService(Lifecycle(), Metrics(), ServerSettings())
+    service.loop_watch.late_s = 1.0
+    answers: list[Refusal | None] = []
+
+    class Queue:
+        def glance(self, deadline_s: float) -> Refusal | None:
+            return answers.pop()
+
+    class Two:
+        batcher, default = Queue(), True
+
+        def __iter__(self) -> Iterator[Two]:
+            return iter((self, self))
+
+    service.models = Two()  # type: ignore[assignment]
+    late, later = (Refusal(Reason.CONGESTED, "late", retry_after_s=s) for s in (0.1, 0.2))
+    answers[:] = [None, late]
+    assert service.glance(0.05) is None
+    answers[:] = [late, later]
+    assert service.glance(0.05) is late
+
+
+def test_the_lag_of_answers_fades_with_time_and_a_halt_is_not_expected_again() -> None:
+    control = LoadControl(8, 512, LoadPolicy(), CostModel(), Metrics())
+    control.note_lag(2.0, 100.0)
+    assert control.lag_s(100.0) == pytest.approx(0.25)
+    assert control.lag_s(100.5) == pytest.approx(0.125)
+    control.note_lag(0.001, 101.0)
+    assert control.lag_s(101.0) == pytest.approx(0.0625)
+    assert control.lag_s(110.0) < 0.001
+
+
+def test_what_could_never_be_answered_and_what_was_not_read_is_no_load() -> None:
+    costs = CostModel()
+    costs.observe(Work(1, 10), 0.1)
+    control = LoadControl(8, 512, LoadPolicy(), costs, Metrics())
+    control.begin(Work(1, 10), 10.0)
+
+    def refused(ask: Callable[..., object], had_s: float) -> float:
+        place = Place("arm-7", Work(1, 10), 10.0 + had_s, 10.0 + had_s)
+        with pytest.raises(Refusal):
+            ask(place, [], 10.0, replaces=False)
+        return control.load(10.0)
+
+    assert refused(control.screen, 0.001) == 0.0
+    assert refused(control.predict, 0.15) == 0.0
+    assert refused(control.screen, 0.15) > 0.0
 
 
 def test_a_few_robots_are_looked_at_however_slow_the_machine_is() -> None:
