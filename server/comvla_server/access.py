@@ -7,7 +7,7 @@ import ssl
 
 import grpc
 
-from comvla_server.admin_auth import AdminAuth, Asgi
+from comvla_server.admin_auth import AdminAuth, Asgi, HostCheck
 from comvla_server.auth import Authenticator
 from comvla_server.door import Door
 from comvla_server.fleet_page import assets
@@ -73,7 +73,8 @@ class Access:
     def guard(self, app: Asgi) -> Asgi:
         """The admin surface, behind its tokens where there are any."""
         if self._admin_tokens is None:
-            return app
+            address = self._settings.admin_address
+            return HostCheck(app, address) if is_loopback(address) else app
         # The page itself is no secret: it asks for a token, and then for everything else.
         open_paths = [*assets(), *(["/metrics"] if self._settings.open_metrics else [])]
         return AdminAuth(app, self._admin_tokens, open_paths)

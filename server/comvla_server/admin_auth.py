@@ -6,9 +6,11 @@ import base64
 import binascii
 from collections.abc import Awaitable, Callable, Iterable
 from typing import Any
+from urllib.parse import urlsplit
 
 from comvla_server.auth import bearer_token
 from comvla_server.identity import MAY_SWAP, Identity
+from comvla_server.ports import is_loopback
 from comvla_server.tokens import TokenFile
 
 ADMITTED = "comvla_admitted"
@@ -20,7 +22,11 @@ _OPEN = frozenset({"/healthz", "/readyz"})
 
 _REFUSED = b"expected a token of the admin tokens file: `comvla-server token new` makes one\n"
 
-__all__ = ["MAY_SWAP", "AdminAuth", "Asgi", "rights_of"]
+_MISDIRECTED = (
+    b"expected localhost or the address of --admin-host as Host; give --admin-tokens-file\n"
+)
+
+__all__ = ["MAY_SWAP", "AdminAuth", "Asgi", "HostCheck", "rights_of"]
 
 _OPERATOR = "comvla.operator"
 
@@ -66,6 +72,44 @@ class AdminAuth:
         given = [value for name, value in scope["headers"] if name == b"authorization"]
         token = _token(given[0]) if len(given) == 1 else None
         return None if token is None else self._tokens.find(token)
+
+
+class HostCheck:
+    """ASGI middleware for an address of this machine without tokens: answers requests to it only.
+
+    A page of the internet can have its own name lead to 127.0.0.1 and then read what is there; its
+    requests still carry its name.
+
+    Args:
+        app: what is behind it.
+        host: where it listens, the one name besides those of the loopback.
+    """
+
+    def __init__(self, app: Asgi, host: str) -> None:
+        self._app = app
+        self._host = host.lower()
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Passes on, or answers 421."""
+        if scope["type"] == "lifespan" or self._meant(scope):
+            await self._app(scope, receive, send)
+            return
+        headers = [
+            (b"content-type", b"text/plain"),
+            (b"content-length", str(len(_MISDIRECTED)).encode()),
+        ]
+        await send({"type": "http.response.start", "status": 421, "headers": headers})
+        await send({"type": "http.response.body", "body": _MISDIRECTED})
+
+    def _meant(self, scope: Any) -> bool:
+        given = [value for name, value in scope["headers"] if name == b"host"]
+        if len(given) != 1:
+            return False
+        try:
+            host = urlsplit(f"//{given[0].decode('ascii')}").hostname
+        except ValueError:
+            return False
+        return host is not None and (host == self._host or is_loopback(host))
 
 
 def rights_of(scope: Any) -> frozenset[str]:

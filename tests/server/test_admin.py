@@ -105,6 +105,25 @@ async def test_model_and_sessions_are_unavailable_while_loading(cloud: StubCloud
         await server.stop()
 
 
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost", 200),
+        ("LOCALHOST:8080", 200),
+        ("127.0.0.1:1", 200),
+        ("[::1]:8080", 200),
+        ("rebound.example", 421),
+        ("localhost.rebound.example:8080", 421),
+        ("user@rebound.example", 421),
+        ("192.0.2.1", 421),
+        ("", 421),
+        ("[", 421),
+    ],
+)
+def test_a_name_that_was_led_here_reads_nothing(http: httpx.Client, host: str, status: int) -> None:
+    assert http.get("/v1/sessions", headers={"host": host}).status_code == status
+
+
 @pytest.mark.parametrize("path", ["/docs", "/docs/oauth2-redirect", "/redoc"])
 def test_no_page_loads_scripts_of_other_hosts(http: httpx.Client, path: str) -> None:
     assert http.get(path).status_code == 404

@@ -73,6 +73,11 @@ def test_no_spelling_of_a_path_goes_round_it(http: httpx.Client, path: str) -> N
     assert "comvla_" not in answer.text
 
 
+def test_a_token_answers_under_any_name(http: httpx.Client) -> None:
+    headers = bearer(OPERATOR) | {"host": "gateway.example"}
+    assert http.get("/v1/sessions", headers=headers).status_code == 200
+
+
 def test_two_headers_are_no_token(http: httpx.Client) -> None:
     twice = [("authorization", f"Bearer {OPERATOR}"), ("authorization", f"Bearer {ARM}")]
     assert http.get("/metrics", headers=twice).status_code == 401

@@ -186,7 +186,7 @@ def test_a_watcher_that_does_not_read_is_dropped_and_holds_nobody_up(
         Robot(server.target) as robot,
         socket.create_connection(("127.0.0.1", server.server.admin_port)) as deaf,
     ):
-        deaf.sendall(b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n")
+        deaf.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
         feed = server.server._feed
         assert feed is not None
         eventually(lambda: feed.watchers == 1)
