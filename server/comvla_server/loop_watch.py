@@ -81,6 +81,7 @@ class LoopWatch:
         """Begins anew: what was seen before anybody was served says nothing of the time after it."""
         self._last = None
         self._lived = self._died = 0
+        self._hopeless.clear()
         self.busy = self.late_s = 0.0
         self.looked_at = 1.0
 

@@ -168,11 +168,18 @@ def test_what_a_loop_missed_while_a_model_was_loaded_is_forgotten() -> None:
     times = Times()
     watch = LoopWatch(lambda: times.now_s, lambda: times.worked_s)
     looks(watch, times, 20, busy=0.95)
-    watch.note(died=True)
+    for i in range(5):
+        watch.note(died=True)
+        watch.note(died=True, who=f"robot-{i}", hopeless=True)
     looks(watch, times, 1, busy=0.95, late_s=0.3)
     assert watch.congested
     assert watch.looked_at < 1.0
     times.now_s += 0.3  # the last thing before robots are answered, which the loop has not seen yet
+    for i in range(10):
+        watch.note(died=True, who=f"robot-{i}", hopeless=True)
+    watch.forget()
+    looks(watch, times, 20, busy=0.95)
+    assert watch.looked_at == 1.0
     watch.forget()
     assert watch.looked_at == 1.0
     assert not watch.congested
