@@ -1,7 +1,7 @@
 """``comvla-server`` with a model that waits for the test: run as a process of its own.
 
-Usage: gated_server.py FIFO ARGUMENTS…; from the second call on (after the warm-up at batch 1) every
-forward pass opens FIFO for reading, and so waits until the test has opened and closed it for writing.
+Usage: gated_server.py FIFO ARGUMENTS…; after the warm-up every forward pass opens FIFO for reading,
+and so waits until the test has opened and closed it for writing.
 """
 
 from __future__ import annotations
@@ -23,15 +23,29 @@ class GatedCloud(StubCloud):
     def __init__(self, fifo: str) -> None:
         super().__init__()
         self._fifo = fifo
+        self.gated = False
 
     def predict(self, requests: list[PolicyRequest]) -> list[NDArray[np.float32]]:
-        if self.batches:
+        if self.gated:
             with open(self._fifo) as gate:
                 gate.read()
         return super().predict(requests)
 
 
+class GatedEngine(Engine):
+    """Its warm-up runs freely."""
+
+    def __init__(self, cloud: GatedCloud) -> None:
+        super().__init__(cloud)
+        self._gate = cloud
+
+    def warm_up(self, max_batch: int) -> None:
+        """As any other; then the gate closes."""
+        super().warm_up(max_batch)
+        self._gate.gated = True
+
+
 if __name__ == "__main__":
     fifo, *arguments = sys.argv[1:]
-    serve_command.load_engine = lambda *_: Engine(GatedCloud(fifo))  # type: ignore[assignment]
+    serve_command.load_engine = lambda *_: GatedEngine(GatedCloud(fifo))  # type: ignore[assignment]
     sys.exit(cli.main([*arguments, "--max-batch", "1"]))
