@@ -83,7 +83,7 @@ export class Table {
     this.rows = new Map();
     this.key = "name";
     this.down = false;
-    this.sorted_ms = 0;
+    this.sorted_ms = -Infinity;
     this.heads = COLUMNS.map((column) => {
       const head = node("th", { scope: "col", class: column.cls ?? "" });
       const unit = node("small", {}, column.unit ?? "");
@@ -109,12 +109,12 @@ export class Table {
       if (!row) {
         this.rows.set(number, row = new Row(robot, this.choose));
         this.body.append(row.root);
-        this.sorted_ms = 0;
+        this.sorted_ms = -Infinity;
       }
       row.update(robot, now_s, number === chosen);
     }
     // Not under the hands of somebody who walks through the rows.
-    const busy = this.body.contains(document.activeElement) && this.sorted_ms > 0;
+    const busy = this.body.contains(document.activeElement) && Number.isFinite(this.sorted_ms);
     if (!busy && performance.now() - this.sorted_ms > SETTLE_MS) this.#sort();
   }
 
