@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from comvla.v1.policy_pb2 import InferProgressiveHead, InferProgressiveRequest, InferRequest
@@ -37,6 +37,7 @@ def requests(count: int) -> list[InferRequest]:
 
 
 @given(st.lists(st.integers(1, 700), min_size=1, max_size=30))
+@example([1, 378, 700])  # between a step's tag and its value
 def test_calls_are_read_however_the_stream_is_cut(cuts: list[int]) -> None:
     sent = requests(3)
     stream = PREFACE + frame(PING, 0, bytes(8))

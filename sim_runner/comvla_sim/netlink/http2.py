@@ -154,7 +154,11 @@ def session_and_step(message: bytes) -> tuple[str, int] | None:
             rest = message[at + length :]
             if not rest:
                 return None
-            return text, _varint(rest, 1)[0] if rest[0] == 0x10 else 0
+            if rest[0] != 0x10:
+                return text, 0
+            step, end = _varint(rest, 1)
+            whole = end > 1 and not rest[end - 1] & 0x80
+            return (text, step) if whole else None
         message = field
     return None
 
