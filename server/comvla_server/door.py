@@ -23,8 +23,8 @@ from comvla_server.log_throttle import LogThrottle
 from comvla_server.metrics import Metrics
 from comvla_server.rate_limits import RateLimits
 from comvla_server.refusals import Reason, Refusal
-from comvla_server.service import STATUS, hints
 from comvla_server.settings import ServerSettings
+from comvla_server.statuses import STATUS, hints
 from comvla_server.wording import shown
 
 _log = logging.getLogger(__name__)

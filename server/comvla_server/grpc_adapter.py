@@ -13,8 +13,9 @@ from grpc_reflection.v1alpha import reflection
 
 from comvla import codec
 from comvla.v1 import policy_pb2
-from comvla_server.service import STATUS, PolicyService
+from comvla_server.service import PolicyService
 from comvla_server.settings import ServerSettings
+from comvla_server.statuses import STATUS
 
 SERVICE_NAME = policy_pb2.DESCRIPTOR.services_by_name["PolicyService"].full_name
 

@@ -24,8 +24,9 @@ from comvla_server.model_loading import load_engine
 from comvla_server.refusals import Refusal
 from comvla_server.runtimes import Runtimes
 from comvla_server.secret_files import Watcher
-from comvla_server.service import STATUS, PolicyService
+from comvla_server.service import PolicyService
 from comvla_server.settings import ServerSettings
+from comvla_server.statuses import STATUS
 from comvla_server.tokens import TokenFile
 from comvla_server.tracing import Tracing
 

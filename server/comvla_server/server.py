@@ -127,8 +127,8 @@ class Server:
             self._tracing = Tracing.of(settings)
         server = make_grpc_server(settings, [access.door])
         service = PolicyService(self.lifecycle, self.metrics, settings, tracing=self._tracing)
-        access.door.glance = service.glance
-        access.door.on_lost = service.note_lost
+        access.door.glance = service.screening.glance
+        access.door.on_lost = service.screening.note_lost
         add_policy_service(server, service)
         await self._health.register(server)
         admin_socket = listen(settings.admin_address, settings.admin_port, "--admin-port")
@@ -152,7 +152,7 @@ class Server:
         self._access = access
         self._watching = [
             asyncio.create_task(access.watch()),
-            asyncio.create_task(service.loop_watch.run()),
+            asyncio.create_task(service.screening.loop_watch.run()),
         ]
 
     async def make_ready(self, before: Callable[[], object] | None = None) -> ModelInfo:
@@ -195,7 +195,7 @@ class Server:
         if before is not None:
             before()
         # Loading kept the loop from its work; the first robot must not be turned away for that.
-        self._service.loop_watch.forget()
+        self._service.screening.loop_watch.forget()
         self.lifecycle.enter(Phase.SERVING)
         await self._health.serving()
         _log.info("serving %s", info.name, extra={"grpc": self.target})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
@@ -13,60 +13,25 @@ from typing import Any
 import grpc
 
 from comvla import codec, handshake
-from comvla.errors import CodecError
-from comvla.images import MAX_VIEW_PIXELS, coding_name, picture_bytes
-from comvla.load_hints import LoadHints
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.accounts import Answered, CallAccounts
 from comvla_server.calls import CallRecord, this_call
 from comvla_server.fleet import Fleet
-from comvla_server.identity import caller
 from comvla_server.lifecycle import Lifecycle
-from comvla_server.loop_watch import LoopWatch
 from comvla_server.memory import BytesInFlight, Lease
 from comvla_server.metrics import Metrics
 from comvla_server.models import Models, Runtime
 from comvla_server.piecewise import PieceReader
 from comvla_server.refusals import Reason, Refusal
+from comvla_server.screening import Screening
 from comvla_server.settings import ServerSettings
+from comvla_server.statuses import STATUS, hints
 from comvla_server.tickets import Answer
 from comvla_server.tracing import Tracing, current_trace
+from comvla_server.traffic import Traffic, announced_tokens, decoded_bytes
 from comvla_server.validation import content_digest
 from comvla_server.version import server_version
 from comvla_vla.request import AnyRequest
-
-_LEAST_TIME_S = 0.02
-"""Whoever arrives with less cannot count on an answer, whatever the model."""
-
-STATUS = {
-    Reason.MALFORMED: grpc.StatusCode.INVALID_ARGUMENT,
-    Reason.INVALID: grpc.StatusCode.INVALID_ARGUMENT,
-    Reason.CONFLICT: grpc.StatusCode.INVALID_ARGUMENT,
-    Reason.UNKNOWN_MODEL: grpc.StatusCode.NOT_FOUND,
-    Reason.MISMATCH: grpc.StatusCode.FAILED_PRECONDITION,
-    Reason.OVERSIZE: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    Reason.OVERLOAD: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    Reason.PREDICTED_LATE: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    Reason.CONGESTED: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    Reason.FAIR_SHARE: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    Reason.SHORT: grpc.StatusCode.DEADLINE_EXCEEDED,
-    Reason.KEY_FRAME: grpc.StatusCode.ABORTED,
-    Reason.SUPERSEDED: grpc.StatusCode.ABORTED,
-    Reason.DEADLINE: grpc.StatusCode.DEADLINE_EXCEEDED,
-    Reason.CANCELLED: grpc.StatusCode.CANCELLED,
-    Reason.LOADING: grpc.StatusCode.UNAVAILABLE,
-    Reason.DRAINING: grpc.StatusCode.UNAVAILABLE,
-    Reason.MODEL: grpc.StatusCode.INTERNAL,
-    Reason.NO_IDENTITY: grpc.StatusCode.UNAUTHENTICATED,
-    Reason.NOT_OWNER: grpc.StatusCode.PERMISSION_DENIED,
-    Reason.RATE: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    Reason.SLOW: grpc.StatusCode.DEADLINE_EXCEEDED,
-}
-
-
-def hints(refusal: Refusal) -> tuple[tuple[str, str], ...]:
-    """Trailing metadata of a refusal: what the robot may do about it."""
-    return LoadHints(refusal.retry_after_s, refusal.suggested_tokens).to_metadata()
 
 
 class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
@@ -82,7 +47,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
     Attributes:
         models: what answers, by name; empty while loading.
-        loop_watch: whether the event loop keeps up; runs where its ``run`` does.
+        screening: whether calls are worth reading.
         fleet: what robots did lately.
     """
 
@@ -99,9 +64,10 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         self.models = Models()
         self._lifecycle = lifecycle
         self._metrics = metrics
+        self._traffic = Traffic(metrics)
         self._settings = settings
         self._clock = clock
-        self.loop_watch = LoopWatch()
+        self.screening = Screening(self.models, settings.admission, clock)
         self.fleet = fleet or Fleet()
         self._accounts = CallAccounts(metrics, self.fleet, settings.default_deadline_s, clock)
         self._in_flight = BytesInFlight(settings.max_bytes_in_flight)
@@ -135,36 +101,6 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             run_options=runtime.engine.run_options,
             edge_fingerprints=sorted(runtime.validator.also),
         )
-
-    def glance(self, time_remaining_s: float | None) -> Refusal | None:
-        """Whether a call that nobody has read yet can be answered in time; None where it may be.
-
-        Only where the event loop hardly keeps up: to read a request takes longer than to turn it away, and what is
-        turned away unread cannot be known for a repeat or for the newest observation of a robot that waits.
-
-        Args:
-            time_remaining_s: seconds until the caller gives up, None where it did not say.
-        """
-        watch = self.loop_watch
-        if not self._settings.admission or self.runtime is None or time_remaining_s is None:
-            return None
-        if watch.skips():
-            return Refusal(
-                Reason.CONGESTED,
-                "more calls come than this machine can read in time: ask again later, or add a replica",
-                retry_after_s=min(1.0, max(0.0, time_remaining_s)),
-            )
-        if not watch.congested:
-            return None
-        # Which model the call means stands in what was not read: it may pass where any could answer it.
-        deadline_s = self._clock() + time_remaining_s
-        refusals = []
-        for runtime in self.models:
-            refusal = runtime.batcher.glance(deadline_s)
-            if refusal is None:
-                return None
-            refusals.append(refusal)
-        return min(refusals, key=lambda refusal: refusal.retry_after_s or 0.0)
 
     async def Infer(
         self, request: policy_pb2.InferRequest, context: grpc.aio.ServicerContext[Any, Any]
@@ -201,8 +137,8 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         """
 
         async def work(started_s: float, deadline_s: float) -> Answered:
-            self._count_message(request.ByteSize())
-            self._count_content(request)
+            self._traffic.count_message(request.ByteSize())
+            self._traffic.count_content(request)
             with self._in_flight.lease() as lease:
                 lease.take(request.ByteSize())
                 runtime = self._find(request.model)
@@ -210,7 +146,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                     return await self._answer(runtime, request, lease, started_s, deadline_s)
 
         answer = self._accounts.run(request, time_remaining_s, work)
-        return await self._watched(answer, request, time_remaining_s)
+        return await self.screening.watched(answer, request, time_remaining_s)
 
     async def infer_progressive(
         self, messages: AsyncIterator[Any], time_remaining_s: float | None
@@ -234,44 +170,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 return await self._answer_stream(request, messages, lease, started_s, deadline_s)
 
         answer = self._accounts.run(request, time_remaining_s, work)
-        return await self._watched(answer, request, time_remaining_s)
-
-    async def _watched(
-        self,
-        answer: Awaitable[policy_pb2.InferResponse],
-        request: policy_pb2.InferRequest,
-        time_remaining_s: float | None,
-    ) -> policy_pb2.InferResponse:
-        """Tells the loop's watch what became of a call."""
-        died = False
-        try:
-            return await answer
-        except asyncio.CancelledError:
-            died = True
-            raise
-        except Refusal as refusal:
-            died = refusal.reason is Reason.DEADLINE
-            raise
-        finally:
-            if died:
-                self.note_lost(caller().name or request.session_id, time_remaining_s)
-            else:
-                self.loop_watch.note(died=False)
-
-    def note_lost(self, who: str, time_remaining_s: float | None) -> None:
-        """Tells the loop's watch of a call that died on its way.
-
-        Args:
-            who: made it.
-            time_remaining_s: seconds that it had when it was first seen, None where it did not say.
-        """
-        hopeless = time_remaining_s is not None and time_remaining_s < self._least_time_s()
-        self.loop_watch.note(died=True, who=who, hopeless=hopeless)
-
-    def _least_time_s(self) -> float:
-        """Seconds in which no model can be expected to answer, however idle."""
-        usual_s = min((runtime.batcher.usual_s for runtime in self.models), default=0.0)
-        return max(_LEAST_TIME_S, usual_s)
+        return await self.screening.watched(answer, request, time_remaining_s)
 
     def _traced(
         self, method: str, context: grpc.aio.ServicerContext[Any, Any]
@@ -287,7 +186,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             f"expected a comvla.v1.InferRequest, got {size_bytes} bytes that do not parse as one: "
             "build requests from the contract's generated code",
         )
-        self._count_message(size_bytes)
+        self._traffic.count_message(size_bytes)
         nobodys = policy_pb2.InferRequest()
         self._accounts.note_refusal(nobodys, refusal)
         call = CallRecord(wire_bytes=codec.wire_bytes(size_bytes))
@@ -321,7 +220,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
 
         def note(message: policy_pb2.InferProgressiveRequest) -> None:
             size = message.ByteSize()
-            self._count_message(size)
+            self._traffic.count_message(size)
             lease.take(size)
 
         reader = PieceReader(messages, note, self._clock)
@@ -343,7 +242,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                     request.payload = await reader.collect(window_s)
                     self._metrics.step_phase.labels("collect").observe(self._clock() - headed_s)
             finally:
-                self._count_payload(reader.payload)
+                self._traffic.count_payload(reader.payload)
                 self._metrics.streams.labels(reader.ending).inc()
             return await self._answer(runtime, request, lease, started_s, deadline_s, digest)
 
@@ -366,7 +265,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         batcher = runtime.batcher
         pictures = request.HasField("images")
         most = runtime.engine.info.num_tokens
-        tokens = most if pictures else min(most, _announced_tokens(request.payload))
+        tokens = most if pictures else min(most, announced_tokens(request.payload))
         if tokens:  # else it is no observation, and will be told so
             batcher.screen(request.session_id, request.step, tokens, deadline_s, pictures=pictures)
         if digest is None:
@@ -375,7 +274,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         decode_began_s, decode_s = self._clock(), 0.0
         policy_request: AnyRequest | None = None
         if ticket is None:
-            lease.take(_decoded_bytes(request))
+            lease.take(decoded_bytes(request))
             policy_request = await self._read(runtime, request, deadline_s)
             this_call().note_read(policy_request, runtime.engine.info)
             decode_s = self._clock() - decode_began_s
@@ -443,58 +342,3 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             # Checked: the model's own, or that of one with the same edge half.
             model_fingerprint=request.model_fingerprint,
         )
-
-    def _count_message(self, size_bytes: int) -> None:
-        """What crossed the link, whatever becomes of it."""
-        wire_bytes = codec.wire_bytes(size_bytes)
-        self._metrics.tx_framed_bytes.inc(wire_bytes)
-        this_call().wire_bytes += wire_bytes
-
-    def _count_content(self, request: policy_pb2.InferRequest) -> None:
-        self._count_payload(request.payload)
-        if request.HasField("images"):
-            file_bytes = picture_bytes(request.images)
-            self._metrics.tx_encoded_bytes.inc(request.images.ByteSize())
-            self._metrics.tx_image_bytes.inc(file_bytes)
-            self._metrics.tx_payload_bytes.inc(file_bytes)
-            this_call().note_content(file_bytes, coding_name(request.images.coding) or "")
-
-    def _count_payload(self, payload: bytes | bytearray) -> None:
-        metrics = self._metrics
-        metrics.tx_encoded_bytes.inc(len(payload))
-        try:
-            header = codec.read_header(payload)
-        except CodecError:
-            return
-        tokens = _whole_tokens(header, len(payload))
-        metrics.tokens_received.inc(tokens)
-        metrics.request_tokens.observe(tokens)
-        paper_bytes = codec.payload_bytes(tokens, header.token_dim, header.quantization)
-        metrics.tx_payload_bytes.inc(paper_bytes)
-        this_call().note_content(paper_bytes, header.quantization)
-
-
-def _announced_tokens(payload: bytes) -> int:
-    """Tokens that a payload holds, by its header; 0 where it is no payload."""
-    try:
-        header = codec.read_header(payload)
-    except CodecError:
-        return 0
-    return _whole_tokens(header, len(payload))
-
-
-def _whole_tokens(header: codec.PayloadHeader, length: int) -> int:
-    arrived = codec.prefix_tokens(
-        length, header.token_dim, header.quantization, num_towers=len(header.tower_dims)
-    )
-    return min(arrived, header.count)
-
-
-def _decoded_bytes(request: policy_pb2.InferRequest) -> int:
-    """What tokens take as float32, and what pictures that may be decoded take."""
-    pixels = sum(min(v.height * v.width, MAX_VIEW_PIXELS) for v in request.images.views)
-    try:
-        header = codec.read_header(request.payload)
-    except CodecError:
-        return 3 * pixels
-    return 3 * pixels + 4 * _whole_tokens(header, len(request.payload)) * header.token_dim

@@ -15,9 +15,9 @@ from comvla_client.registry import IMAGE_FORMS, SELECTORS
 from comvla_client.report import StepReport
 from comvla_client.snr import __all__ as SNR_NAMES
 from comvla_server.metrics import Metrics
-from comvla_server.service import STATUS
 from comvla_server.setting_fields import fields_of
 from comvla_server.settings import ServerSettings
+from comvla_server.statuses import STATUS
 
 README = markdown.ROOT / "README.md"
 SERVER = markdown.ROOT / "docs" / "server.md"

@@ -29,8 +29,8 @@ from comvla.v1.policy_pb2 import InferProgressiveHead, InferProgressiveRequest, 
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.piecewise import MAX_WINDOW_S
-from comvla_server.service import STATUS
 from comvla_server.settings import ServerSettings
+from comvla_server.statuses import STATUS
 
 INVALID = grpc.StatusCode.INVALID_ARGUMENT
 LATE = grpc.StatusCode.DEADLINE_EXCEEDED

@@ -17,13 +17,12 @@ from comvla.load_hints import LoadHints
 from comvla_server.background import BackgroundServer
 from comvla_server.cost_model import CostModel, Work
 from comvla_server.engine import Engine
-from comvla_server.lifecycle import Lifecycle
 from comvla_server.load_control import LoadControl
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.loop_watch import LoopWatch
 from comvla_server.metrics import Metrics
 from comvla_server.refusals import Reason, Refusal
-from comvla_server.service import PolicyService
+from comvla_server.screening import Screening
 from comvla_server.settings import ServerSettings
 from comvla_server.tickets import Place
 from comvla_vla.request import PolicyRequest
@@ -122,8 +121,8 @@ def test_where_the_loop_does_not_keep_up_calls_are_turned_away_unread(
     cloud.wait_until_running()
     service = server.server._service
     assert service is not None
-    service.loop_watch.look = lambda: None  # type: ignore[method-assign]
-    service.loop_watch.late_s = 1.0
+    service.screening.loop_watch.look = lambda: None  # type: ignore[method-assign]
+    service.screening.loop_watch.late_s = 1.0
     names = (f"robot-{i}" for i in range(1000))
     codes = []
 
@@ -238,18 +237,16 @@ def test_a_call_with_less_time_than_any_answer_takes_is_hopeless(
     service = server.server._service
     assert service is not None
     noted: list[tuple[str, bool]] = []
-    service.loop_watch.note = (  # type: ignore[method-assign]
+    service.screening.loop_watch.note = (  # type: ignore[method-assign]
         lambda *, died, who="", hopeless=False: noted.append((who, hopeless))
     )
-    service.note_lost("arm-7", 0.001)
-    service.note_lost("arm-8", 1.0)
-    service.note_lost("arm-9", None)
+    service.screening.note_lost("arm-7", 0.001)
+    service.screening.note_lost("arm-8", 1.0)
+    service.screening.note_lost("arm-9", None)
     assert noted == [("arm-7", True), ("arm-8", False), ("arm-9", False)]
 
 
 def test_a_glance_asks_every_model_that_a_call_may_mean() -> None:
-    service = PolicyService(Lifecycle(), Metrics(), ServerSettings())
-    service.loop_watch.late_s = 1.0
     answers: list[Refusal | None] = []
 
     class Queue:
@@ -262,12 +259,13 @@ def test_a_glance_asks_every_model_that_a_call_may_mean() -> None:
         def __iter__(self) -> Iterator[Two]:
             return iter((self, self))
 
-    service.models = Two()  # type: ignore[assignment]
+    screening = Screening(Two(), admission=True, clock=lambda: 0.0)  # type: ignore[arg-type]
+    screening.loop_watch.late_s = 1.0
     late, later = (Refusal(Reason.CONGESTED, "late", retry_after_s=s) for s in (0.1, 0.2))
     answers[:] = [None, late]
-    assert service.glance(0.05) is None
+    assert screening.glance(0.05) is None
     answers[:] = [late, later]
-    assert service.glance(0.05) is late
+    assert screening.glance(0.05) is late
 
 
 def test_the_lag_of_answers_fades_with_time_and_a_halt_is_not_expected_again() -> None:

@@ -10,8 +10,8 @@ from comvla_client.errors import TransportError
 from comvla_client.streaming import PayloadStream
 from comvla_server.engine import CloudHalf, Engine
 from comvla_server.refusals import Refusal
-from comvla_server.service import STATUS
 from comvla_server.settings import ServerSettings
+from comvla_server.statuses import STATUS
 from comvla_server.validation import Validator
 from comvla_server.version import server_version
 from comvla_server.vision import Vision

@@ -23,7 +23,8 @@ from comvla import codec
 from comvla.v1 import policy_pb2
 from comvla_server.refusals import Refusal
 from comvla_server.server import Server
-from comvla_server.service import STATUS, PolicyService
+from comvla_server.service import PolicyService
+from comvla_server.statuses import STATUS
 from comvla_sim.bench.processes import announce
 from comvla_sim.fuzz.cases import Case
 from comvla_sim.fuzz.mutations import (

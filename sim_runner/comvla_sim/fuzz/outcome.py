@@ -8,7 +8,7 @@ from typing import Any
 
 import grpc
 
-from comvla_server.service import STATUS
+from comvla_server.statuses import STATUS
 
 # What a stranger's request may be answered with. INTERNAL and UNAVAILABLE would be the server's own
 # fault, and nobody here is asked for a token.
