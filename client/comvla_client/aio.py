@@ -11,10 +11,11 @@ from comvla.model_info import ModelInfo
 from comvla_client import channel
 from comvla_client.access import TlsOptions, Token, check_unused
 from comvla_client.budget import PAPER_LINK, LinkProfile
-from comvla_client.core import ClientCore, Prepared
+from comvla_client.core import ClientCore
 from comvla_client.edge import EdgeModel
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.observation import Observation
+from comvla_client.prepared import Prepared
 from comvla_client.queue import Actions
 from comvla_client.reaching import make_aio_transport
 from comvla_client.report import ActionChunk

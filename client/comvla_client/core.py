@@ -11,7 +11,7 @@ import re
 import secrets
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,51 +27,21 @@ from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.edge import EdgeModel
 from comvla_client.errors import TransportError
 from comvla_client.observation import Observation, check_instruction, check_observation
+from comvla_client.planning import Planner
+from comvla_client.prepared import Prepared
 from comvla_client.queue import ActionQueue, Actions
 from comvla_client.registry import make_uplink
-from comvla_client.report import PHASES, ActionChunk, FallbackReason, Load, StepReport
+from comvla_client.report import PHASES, ActionChunk, Load, StepReport
 from comvla_client.selection import Selector
-from comvla_client.sending import Floor, Outcome, Plan, SendingPolicy, Situation, make_policy
-from comvla_client.sizing import Budget, TokenSizer
+from comvla_client.sending import Floor, SendingPolicy, make_policy
+from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading, as_reading, as_source
-from comvla_client.streaming import PayloadStream
-from comvla_client.uplink import Setup, Uplink, UplinkForm
+from comvla_client.uplink import Setup, UplinkForm
 
 WIND_UP_S = 0.002
 """What is kept of a deadline for giving up a call and writing the report, in seconds."""
 
 _SESSION_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@/+=-]{0,99}")
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A step between its request and its answer.
-
-    Attributes:
-        request: what to send; None when nothing is sent.
-        report: the account so far.
-        started: when the step began, on ``time.perf_counter``.
-        deadline: when its call has to be over, on the same clock.
-        plan: what the policy of sending decided.
-        uplink: what is sent; None when nothing is.
-        stream: the payload in pieces; ``request`` then has none. None where it goes whole.
-        reason: why nothing is sent, where nothing is.
-        planned: when it was decided what to send, on the same clock.
-    """
-
-    request: InferRequest | None
-    report: StepReport
-    started: float
-    deadline: float
-    plan: Plan
-    uplink: Uplink | None = None
-    stream: PayloadStream | None = None
-    reason: FallbackReason = "no_link"
-    planned: float = 0.0
-
-    def remaining_s(self) -> float:
-        """Seconds left for the call; negative when the edge half alone took too long."""
-        return self.deadline - time.perf_counter()
 
 
 class ClientCore:
@@ -217,9 +187,9 @@ class ClientCore:
         self._form.hear(check_instruction(instruction))
         reading = self._read_snr(snr)
         request = self._blank_request(instruction, checked.proprio.tolist(), reading)
-        plan = self._plan(reading, request)
-        report = self._opened(reading, request, plan)
-        plan = self._as_advised(plan)
+        plan = self._planner.plan(reading, request)
+        report = self._planner.opened(reading, request, plan)
+        plan = self._planner.as_advised(plan)
         planned = time.perf_counter()
         deadline = started + self.deadline_s - min(WIND_UP_S, 0.1 * self.deadline_s)
         rng = np.random.default_rng([self._seed, self._episode, self._step])
@@ -248,7 +218,7 @@ class ClientCore:
             return Prepared(None, report, started, deadline, plan, planned=planned)
         stream = None
         if plan.progressive:
-            stream = self._stream(request, uplink.payload, len(uplink.positions), plan)
+            stream = self._planner.stream(request, uplink.payload, len(uplink.positions), plan)
         else:
             uplink.fill(request)
         return Prepared(request, report, started, deadline, plan, uplink, stream, planned=planned)
@@ -298,7 +268,7 @@ class ClientCore:
         self.queue.accept(actions)
         self._form.settle(prepared.request.step, True)
         self._back_off.answered()
-        self._advice.hear(response.load.suggested_tokens)
+        self._planner.advice.hear(response.load.suggested_tokens)
         timings = response.timings
         report = replace(
             self._closed(prepared, call_s, response.tokens_used),
@@ -339,7 +309,7 @@ class ClientCore:
             self._form.settle(prepared.request.step, False)
         reason = prepared.reason if error is None else fallback_reason(error)
         if error is not None:
-            self._advice.hear(error.hints.suggested_tokens)
+            self._planner.advice.hear(error.hints.suggested_tokens)
             if reason == "overloaded":
                 self._back_off.refused(error.hints.retry_after_s)
         detail = prepared.plan.detail if error is None else error.message
@@ -366,130 +336,13 @@ class ClientCore:
         """The next action (A,) of the current chunk, or None when it is time for a step."""
         return self.queue.pop()
 
-    def _plan(self, reading: SnrReading | None, request: InferRequest) -> Plan:
-        if reading is not None:
-            self.sending.hear(reading)
-        sizer, link = self._form.sizer, self._form.sizer.link
-
-        def tokens_in(bits: float, progressive: bool, least: int) -> int:
-            return sizer.tokens_in(
-                bits, request, progressive=progressive, least=least, window_s=link.window_s
-            )
-
-        return self.sending.plan(
-            Situation(
-                reading=reading,
-                link=link,
-                num_tokens=sizer.num_tokens,
-                most_tokens=sizer.most_tokens,
-                min_tokens=sizer.min_tokens,
-                tokens_in=tokens_in,
-                needs_snr=sizer.needs_snr,
-                sends_all=sizer.sends_all,
-            )
-        )
-
-    def _as_advised(self, plan: Plan) -> Plan:
-        """No more tokens than a busy server asked for, but what the policy of sending finds useful."""
-        bound = self._advice.most_tokens
-        if bound is None or not self._form.in_pieces or self._form.sizer.sends_all:
-            return plan
-        bound = max(bound, plan.min_tokens)
-        return replace(plan, count=min(plan.count, bound), expected=min(plan.expected, bound))
-
-    def _opened(self, reading: SnrReading | None, request: InferRequest, plan: Plan) -> StepReport:
-        report = StepReport(
-            session=self.session,
-            step=self._step,
-            uplink=self._form.name,
-            policy=self.sending.name,
-            token_budget=plan.budget,
-            advised_tokens=self._advice.most_tokens,
-            window_s=self._window_s(plan),
-        )
-        if reading is None:
-            return report
-        sizer = self._form.sizer
-        bits = sizer.link.window_bits(reading.snr_db)
-        budgets = sizer.token_budgets(
-            bits,
-            request,
-            progressive=plan.progressive,
-            least=plan.min_tokens,
-            window_s=report.window_s,
-        )
-        paper_budget, framed_budget = (None, None) if budgets is None else budgets
-        return replace(
-            report,
-            snr_db=reading.snr_db,
-            snr_age_s=reading.age_s,
-            capacity_bits=bits,
-            paper_budget=paper_budget,
-            framed_budget=framed_budget,
-        )
-
-    def _window_s(self, plan: Plan) -> float:
-        link = self._form.sizer.link
-        return (plan.periods - 1) * link.period_s + link.window_s
-
-    def _stream(
-        self, request: InferRequest, payload: bytes, count: int, plan: Plan
-    ) -> PayloadStream:
-        sizer, window_s = self._form.sizer, self._window_s(plan)
-        assert isinstance(sizer, TokenSizer), "only tokens go in pieces"
-        bits = 8.0 * len(payload) if plan.cap_bits is None else plan.cap_bits
-        ends = sizer.piece_ends(count, bits, plan.min_tokens)
-        rate = None if plan.cap_bits is None else plan.cap_bits / 8.0 / window_s
-        return PayloadStream(request, payload, ends, window_s, plan.min_tokens, rate)
-
     def _closed(
         self, prepared: Prepared, call_s: float, arrived: int = 0, *, refused: bool = False
     ) -> StepReport:
         """The report with its times and with what crossed; the policy learns from it."""
-        report, uplink, stream = prepared.report, prepared.uplink, prepared.stream
-        timings_s = report.timings_s | {
-            "call": call_s,
-            "total": time.perf_counter() - prepared.started,
-        }
-        report = replace(report, timings_s=timings_s)
-        offered = 0
-        # Without a call nothing crossed the link.
-        if uplink is None or prepared.request is None or call_s == 0.0:
-            report = replace(report, positions=report.positions[:0], image_quality=None)
-        elif stream is not None:
-            offered = stream.taken_tokens
-            report = replace(
-                report,
-                tokens=offered,
-                positions=report.positions[:offered],
-                payload_bytes=self._payload_bytes(offered),
-                encoded_bytes=stream.taken_bytes,
-                framed_bytes=stream.taken_wire_bytes,
-            )
-        else:
-            offered = len(uplink.positions) or uplink.payload_bytes
-            report = replace(
-                report,
-                tokens=len(uplink.positions),
-                payload_bytes=uplink.payload_bytes,
-                encoded_bytes=uplink.encoded_bytes,
-                framed_bytes=codec.wire_bytes(prepared.request.ByteSize()),
-            )
-        if report.tokens:
-            arrived_bits = 8.0 * self._payload_bytes(arrived)
-        else:  # pictures arrive whole or not at all
-            arrived_bits = 8.0 * report.payload_bytes if arrived else 0.0
-        if refused:
-            return report  # turned away or not tried at all: neither says anything of the link
-        self.sending.learn(
-            Outcome(
-                offered_tokens=offered,
-                arrived_tokens=arrived,
-                arrived_bits=arrived_bits,
-                answered=arrived > 0,
-                periods=prepared.plan.periods,
-            )
-        )
+        report, outcome = prepared.closed(call_s, arrived, self._payload_bytes)
+        if not refused:  # turned away or not tried at all: neither says anything of the link
+            self.sending.learn(outcome)
         return report
 
     def _payload_bytes(self, tokens: int) -> int:
@@ -505,9 +358,9 @@ class ClientCore:
         self.deadline_s = _check_deadline(
             self.queue.execute * info.control_period_s if deadline_s is None else deadline_s
         )
-        self._advice = TokenAdvice(info.num_tokens)
         self._back_off = BackOff(self.queue.execute * info.control_period_s)
         self._form.start(Setup(info, self._edge, *self._options))
+        self._planner = Planner(self._form, self.sending, TokenAdvice(info.num_tokens))
 
     def _read_snr(self, snr: float | SnrReading | None) -> SnrReading | None:
         if snr is not None:

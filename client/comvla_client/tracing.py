@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from comvla.errors import DependencyError
 
 if TYPE_CHECKING:
-    from comvla_client.core import Prepared
+    from comvla_client.prepared import Prepared
     from comvla_client.report import ActionChunk
 
 Headers = tuple[tuple[str, str], ...]
