@@ -6,7 +6,7 @@ import ipaddress
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -59,6 +59,14 @@ class TlsOptions:
                 "expected the robot's certificate and its key, got one of them: give both for mutual "
                 "TLS, or neither"
             )
+
+    def with_server_name(self, name: str | None) -> TlsOptions:
+        """These, for a server whose certificate bears a name; a name that was given stays."""
+        return (
+            self
+            if name is None or self.server_name is not None
+            else replace(self, server_name=name)
+        )
 
     def credentials(self) -> grpc.ChannelCredentials:
         """Reads the files.

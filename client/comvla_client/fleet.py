@@ -1,10 +1,10 @@
 """Calls to several servers that answer alike, in turns; who fails is left out until it is well again.
 
 A step stands alone, so any server can answer it, and a repeat of it as well. Where one says that it
-cannot (it is gone, drains, runs another model, is busy), the next is asked at once. Where one is silent for much
-longer than usual, it is asked over a new connection whether it is well, and others too: if another
-says so and it does not, the step is sent to that one as well, and the first answer counts. Only then is
-a payload sent twice: where the link is what is slow, both would only make it slower.
+cannot (it is gone, drains, runs another model, is busy), the next is asked at once. Where one is
+silent for much longer than usual, it is asked over a new connection whether it is well, and two others
+too: if another says so and it does not, the step is sent to that one as well, and the first answer
+counts. Only then is a payload sent twice: where the link is what is slow, both would only make it slower.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextvars import copy_context
-from dataclasses import replace
 from typing import Any, TypeAlias
 
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
@@ -26,15 +25,13 @@ from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.line import Line
 from comvla_client.revival import PATIENCE_S
 from comvla_client.roster import (
-    ELSEWHERE,
     LOOK_UP_EVERY_S,
     PROBE_EVERY_S,
     PROBE_TIMEOUT_S,
     Member,
     Roster,
-    told,
-    worst,
 )
+from comvla_client.search import Search
 from comvla_client.streaming import PayloadStream
 from comvla_client.targets import Address, Addresses
 from comvla_client.transport import GrpcTransport
@@ -73,9 +70,7 @@ class FleetTransport:
         self._prober: threading.Thread | None = None
 
         def make(address: Address) -> Line:
-            named = tls
-            if tls is not None and tls.server_name is None and address.server_name is not None:
-                named = replace(tls, server_name=address.server_name)
+            named = None if tls is None else tls.with_server_name(address.server_name)
             return Line(
                 GrpcTransport(
                     address.target, named, token, insecure=insecure, model=model, patient=False
@@ -126,34 +121,23 @@ class FleetTransport:
             member.transport.close()
 
     def _call(self, work: Work, timeout_s: float) -> Any:
-        attempts = channel.Attempts(timeout_s)
+        search = Search(self._roster, self.target, timeout_s)
         if self._addresses.change and time.monotonic() - self._looked_up > LOOK_UP_EVERY_S:
             self._look_after(at_once=True)
-        tried: list[_Member] = []
-        errors: list[TransportError] = []
         while True:
             self._check_open()
-            member = self._roster.pick(tried) if self._roster.members else None
+            member = search.next()
             if member is None:
                 # Everybody was asked once; those who are merely away may be back.
-                error = worst(errors) if errors else self._nobody()
-                if self._closed.wait(attempts.pause_s(error)):
+                if self._closed.wait(search.pause_s()):
                     raise self._closed_error()
-                tried, errors = told(tried, errors)
                 if not self._roster.members:
                     self._look_up()
                 continue
             try:
-                return self._ask(member, work, attempts.remaining_s(), tried)
+                return self._ask(member, work, search.remaining_s(), search.tried)
             except TransportError as error:
-                if error.code not in ELSEWHERE:
-                    # Where the server was down already, the clock only cut short the last attempt.
-                    failure = worst([*errors, error]) if member.down else error
-                    if failure is not error:
-                        raise failure from error
-                    attempts.pause_s(error)  # raises, and says why the call failed
-                tried.append(member)
-                errors.append(error)
+                search.failed(member, error)
 
     def _ask(self, member: _Member, work: Work, timeout_s: float, tried: list[_Member]) -> Any:
         """One server's answer, or another's where it is silent."""
@@ -196,7 +180,7 @@ class FleetTransport:
         self, silent: _Member, call: Future[Any], deadline: float, tried: list[_Member]
     ) -> _Member | None:
         """Who says that it is well while a server that owes an answer does not; None where that one does."""
-        others = [m for m in self._roster.members if m is not silent and m not in tried]
+        others = self._roster.others(silent, tried)
         if not others:
             return None
         news: queue.SimpleQueue[_Member | None] = queue.SimpleQueue()
@@ -280,6 +264,3 @@ class FleetTransport:
 
     def _closed_error(self) -> ClientClosedError:
         return ClientClosedError(f"the connection to {self.target} was closed: make a new client")
-
-    def _nobody(self) -> TransportError:
-        return TransportError("UNAVAILABLE", f"{self.target} stands for no server that is known")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 from typing import Any, TypeAlias
 
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
@@ -15,15 +14,13 @@ from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.health import check_health_aio
 from comvla_client.revival import PATIENCE_S
 from comvla_client.roster import (
-    ELSEWHERE,
     LOOK_UP_EVERY_S,
     PROBE_EVERY_S,
     PROBE_TIMEOUT_S,
     Member,
     Roster,
-    told,
-    worst,
 )
+from comvla_client.search import Search
 from comvla_client.streaming import PayloadStream
 from comvla_client.targets import Address, Addresses
 from comvla_client.transport_aio import GrpcAioTransport
@@ -63,9 +60,7 @@ class FleetAioTransport:
         self._looked_up = float("-inf")
 
         def make(address: Address) -> GrpcAioTransport:
-            named = tls
-            if tls is not None and tls.server_name is None and address.server_name is not None:
-                named = replace(tls, server_name=address.server_name)
+            named = None if tls is None else tls.with_server_name(address.server_name)
             return GrpcAioTransport(
                 address.target, named, token, insecure=insecure, model=model, patient=False
             )
@@ -119,34 +114,23 @@ class FleetAioTransport:
             self._prober.cancel()
 
     async def _call(self, work: Work, timeout_s: float) -> Any:
-        attempts = channel.Attempts(timeout_s)
+        search = Search(self._roster, self.target, timeout_s)
         if not self._roster.members:
             await self._look_up()
         elif self._addresses.change and time.monotonic() - self._looked_up > LOOK_UP_EVERY_S:
             self._look_after()
-        tried: list[_Member] = []
-        errors: list[TransportError] = []
         while True:
             self._check_open()
-            member = self._roster.pick(tried) if self._roster.members else None
+            member = search.next()
             if member is None:
-                error = worst(errors) if errors else self._nobody()
-                await asyncio.sleep(attempts.pause_s(error))
-                tried, errors = told(tried, errors)
+                await asyncio.sleep(search.pause_s())
                 if not self._roster.members:
                     await self._look_up()
                 continue
             try:
-                return await self._ask(member, work, attempts.remaining_s(), tried)
+                return await self._ask(member, work, search.remaining_s(), search.tried)
             except TransportError as error:
-                if error.code not in ELSEWHERE:
-                    # Where the server was down already, the clock only cut short the last attempt.
-                    failure = worst([*errors, error]) if member.down else error
-                    if failure is not error:
-                        raise failure from error
-                    attempts.pause_s(error)  # raises, and says why the call failed
-                tried.append(member)
-                errors.append(error)
+                search.failed(member, error)
 
     async def _ask(
         self, member: _Member, work: Work, timeout_s: float, tried: list[_Member]
@@ -198,7 +182,7 @@ class FleetAioTransport:
         tried: list[_Member],
     ) -> _Member | None:
         """Who says that it is well while a server that owes an answer does not; None where that one does."""
-        others = [m for m in self._roster.members if m is not silent and m not in tried]
+        others = self._roster.others(silent, tried)
         if not others:
             return None
         probes = {asyncio.ensure_future(_is_well(m)): m for m in (silent, *others)}
@@ -276,9 +260,6 @@ class FleetAioTransport:
 
     def _closed_error(self) -> ClientClosedError:
         return ClientClosedError(f"the connection to {self.target} was closed: make a new client")
-
-    def _nobody(self) -> TransportError:
-        return TransportError("UNAVAILABLE", f"{self.target} stands for no server that is known")
 
 
 async def _is_well(member: _Member) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 import statistics
 import threading
@@ -25,6 +24,9 @@ PROBE_TIMEOUT_S = 0.5
 FOREIGN_FOR_S = 30.0
 """How long a server that runs another model is left alone."""
 
+MOST_PROBED = 2
+"""How many others are asked whether they are well where one is silent."""
+
 LOOK_UP_EVERY_S = 30.0
 """How often a name is looked up again while all is well."""
 
@@ -34,8 +36,6 @@ BUSY = "RESOURCE_EXHAUSTED"
 ELSEWHERE = frozenset({"UNAVAILABLE", "FAILED_PRECONDITION", "NOT_FOUND", "UNIMPLEMENTED", BUSY})
 """Codes of one server that say nothing of the others."""
 
-# First what waiting mends, last what it does not; whatever else was said stands between.
-_PASSES = {"UNAVAILABLE": 0, BUSY: 2, "FAILED_PRECONDITION": 3, "NOT_FOUND": 3, "UNIMPLEMENTED": 3}
 _REMEMBERED = 9
 
 
@@ -135,6 +135,13 @@ class Roster(Generic[T]):
             self._turn = self._members.index(chosen) + 1
             return chosen
 
+    def others(self, silent: Member[T], tried: Collection[Member[T]]) -> list[Member[T]]:
+        """Who may stand in for a server that is silent: few, so that a crowded fleet is not asked by all of its
+        robots at once; those first who were well."""
+        left = [member for member in self.members if member is not silent and member not in tried]
+        random.shuffle(left)
+        return sorted(left, key=lambda member: member.down)[:MOST_PROBED]
+
     def begin(self, member: Member[T]) -> None:
         """A call sets out."""
         with self._lock:
@@ -164,29 +171,3 @@ class Roster(Generic[T]):
     def back(self, member: Member[T]) -> None:
         """It said so."""
         member.down = False
-
-
-def worst(errors: list[TransportError]) -> TransportError:
-    """The failure to tell where every server had one: of several that which may pass soonest.
-
-    A server that is away may be back, and the right one: that the others run another model is told only where
-    all of them do, and that they are busy where nobody else is left: of those, who has time first.
-    """
-
-    def passes(error: TransportError) -> tuple[int, float]:
-        retry_s = error.hints.retry_after_s
-        return _PASSES.get(error.code, 1), math.inf if retry_s is None else retry_s
-
-    return min(errors, key=passes)
-
-
-def told(
-    tried: list[Member[T]], errors: list[TransportError]
-) -> tuple[list[Member[T]], list[TransportError]]:
-    """Those who need not be asked again in this step, since they are there and said no; with what they said."""
-    pairs = [
-        (member, error)
-        for member, error in zip(tried, errors, strict=True)
-        if error.code != "UNAVAILABLE"
-    ]
-    return [member for member, _ in pairs], [error for _, error in pairs]

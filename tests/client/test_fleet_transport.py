@@ -31,7 +31,8 @@ from comvla_client import AsyncComVLAClient, ClientClosedError, ComVLAClient
 from comvla_client.errors import TransportError
 from comvla_client.fleet import FleetTransport
 from comvla_client.line import Line
-from comvla_client.roster import Roster, worst
+from comvla_client.roster import MOST_PROBED, Roster
+from comvla_client.search import worst
 from comvla_client.targets import Address, Addresses, is_fleet
 from comvla_client.transport import GrpcTransport
 
@@ -313,6 +314,20 @@ def test_the_next_in_turn_is_who_is_well_and_idle() -> None:
     assert roster.update([]) == []
     assert roster.update([c.address, Address("host:9")]) == [a, b, d]
     assert roster.members[0] is c
+
+
+def test_few_are_asked_to_stand_in_for_a_silent_server_and_those_first_who_are_well() -> None:
+    roster: Roster[Any] = Roster(lambda address: address)
+    roster.update(Address(f"a:{port}") for port in range(1, 8))
+    members = roster.members
+    silent, tried, well = members[0], members[1:2], members[5]
+    for member in members[2:]:
+        member.down = member is not well
+    for _ in range(20):
+        chosen = roster.others(silent, tried)
+        assert len(chosen) == MOST_PROBED
+        assert chosen[0] is well
+        assert not {id(m) for m in chosen} & {id(m) for m in (silent, *tried)}
 
 
 def test_what_is_a_fleet() -> None:

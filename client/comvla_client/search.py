@@ -1,0 +1,94 @@
+"""One call's way from server to server, until one answers or none is left who may."""
+
+from __future__ import annotations
+
+import math
+from typing import Generic
+
+from comvla_client.channel import Attempts
+from comvla_client.errors import TransportError
+from comvla_client.roster import BUSY, ELSEWHERE, Member, Roster, T
+
+# First what waiting mends, last what it does not; whatever else was said stands between.
+_PASSES = {"UNAVAILABLE": 0, BUSY: 2, "FAILED_PRECONDITION": 3, "NOT_FOUND": 3, "UNIMPLEMENTED": 3}
+
+
+class Search(Generic[T]):
+    """Who was asked for one call, and what they said.
+
+    Args:
+        roster: who may be asked.
+        target: what stands for them, in words.
+        timeout_s: longest that the call may take, in seconds.
+
+    Attributes:
+        tried: who was asked, and need not be asked again.
+    """
+
+    def __init__(self, roster: Roster[T], target: str, timeout_s: float) -> None:
+        self._roster = roster
+        self._target = target
+        self._attempts = Attempts(timeout_s)
+        self._errors: list[TransportError] = []
+        self.tried: list[Member[T]] = []
+
+    def remaining_s(self) -> float:
+        """Seconds left for the call."""
+        return self._attempts.remaining_s()
+
+    def next(self) -> Member[T] | None:
+        """Whom to ask; None where everybody was asked, or nobody is known."""
+        return self._roster.pick(self.tried) if self._roster.members else None
+
+    def pause_s(self) -> float:
+        """Seconds until those who were merely away may be asked again.
+
+        Raises:
+            TransportError: there is no time for that; what was said, and may pass soonest.
+        """
+        nobody = f"{self._target} stands for no server that is known"
+        errors = self._errors or [TransportError("UNAVAILABLE", nobody)]
+        pause_s = self._attempts.pause_s(worst(errors))
+        self.tried, self._errors = told(self.tried, self._errors)
+        return pause_s
+
+    def failed(self, member: Member[T], error: TransportError) -> None:
+        """A server did not answer; another may.
+
+        Raises:
+            TransportError: no other would, either.
+        """
+        if error.code not in ELSEWHERE:
+            # Where the server was down already, the clock only cut short the last attempt.
+            failure = worst([*self._errors, error]) if member.down else error
+            if failure is not error:
+                raise failure from error
+            self._attempts.pause_s(error)  # raises, and says why the call failed
+        self.tried.append(member)
+        self._errors.append(error)
+
+
+def worst(errors: list[TransportError]) -> TransportError:
+    """The failure to tell where every server had one: of several that which may pass soonest.
+
+    A server that is away may be back, and the right one: that the others run another model is told only where
+    all of them do, and that they are busy where nobody else is left: of those, who has time first.
+    """
+
+    def passes(error: TransportError) -> tuple[int, float]:
+        retry_s = error.hints.retry_after_s
+        return _PASSES.get(error.code, 1), math.inf if retry_s is None else retry_s
+
+    return min(errors, key=passes)
+
+
+def told(
+    tried: list[Member[T]], errors: list[TransportError]
+) -> tuple[list[Member[T]], list[TransportError]]:
+    """Those who need not be asked again in this step, since they are there and said no; with what they said."""
+    pairs = [
+        (member, error)
+        for member, error in zip(tried, errors, strict=True)
+        if error.code != "UNAVAILABLE"
+    ]
+    return [member for member, _ in pairs], [error for _, error in pairs]
