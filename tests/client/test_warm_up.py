@@ -75,14 +75,13 @@ def test_filler_is_as_long_as_the_last_request_and_is_accounted_for() -> None:
         raise OSError("no link: the next query will tell")
 
     warm_up = WarmUp(send, clock)
-    for number in range(3):
-        clock.now = 1.2 * number
-        with warm_up.around(70_000):
-            pass
-    assert not sent
-    clock.now = 10.0  # long past the moment
-    with warm_up.around(50_000):
-        pass
+    # The last is long past its moment.
+    for now, request_bytes in ((0.0, 70_000), (1.2, 70_000), (2.4, 70_000), (10.0, 50_000)):
+        with warm_up._changed:  # time passes and the query begins in one, for the thread
+            clock.now = now
+            warm_up.query_begins(request_bytes)
+        warm_up.query_ends(0.0)
+        assert not sent
     clock.now = 20.0
     warm_up.query_ends(0.04)
     assert arrived.wait(10.0)
