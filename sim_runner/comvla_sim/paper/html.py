@@ -9,7 +9,7 @@ from pathlib import Path
 from comvla_sim.paper.document import TITLE, parts
 from comvla_sim.paper.part import Part
 from comvla_sim.paper.results import Results
-from comvla_sim.report.page import POLICY, data_uri, shared_style
+from comvla_sim.report.page import data_uri, document
 
 _CSS = """
 .wide img { width: 100%; height: auto; background: #fff; border-radius: .5rem; }
@@ -25,19 +25,7 @@ def page(results: Results, folder: Path) -> str:
         folder: where the pictures lie.
     """
     body = "".join(_section(part, folder) for part in parts(results))
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="{POLICY}">
-<title>{escape(TITLE)}</title>
-<style>{shared_style()}{_CSS}</style>
-</head>
-<body><main><h1>{escape(TITLE)}</h1>{body}
-<footer>Written by <code>comvla-sim paper</code>.</footer></main></body>
-</html>
-"""
+    return document(TITLE, body, style=_CSS, command="comvla-sim paper")
 
 
 def _section(part: Part, folder: Path) -> str:

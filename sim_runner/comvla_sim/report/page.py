@@ -43,6 +43,30 @@ def shared_style() -> str:
     return files("comvla_sim.report").joinpath("style.css").read_text(encoding="utf-8")
 
 
+def document(title: str, body: str, *, style: str, command: str) -> str:
+    """A page with the look of all pages, which loads nothing from outside.
+
+    Args:
+        title: of the page.
+        body: HTML below the title.
+        style: CSS of this page, behind that of all.
+        command: what wrote it.
+    """
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
+<title>{escape(title)}</title>
+<style>{shared_style()}{style}</style>
+</head>
+<body><main><h1>{escape(title)}</h1>{body}
+<footer>Written by <code>{escape(command)}</code>.</footer></main></body>
+</html>
+"""
+
+
 def page(title: str, sections: Sequence[Section]) -> str:
     """The whole report.
 
@@ -51,19 +75,7 @@ def page(title: str, sections: Sequence[Section]) -> str:
         sections: one for each evaluation.
     """
     body = "".join(_section(section) for section in sections)
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="{POLICY}">
-<title>{escape(title)}</title>
-<style>{shared_style()}{_PLOT_CSS}</style>
-</head>
-<body><main><h1>{escape(title)}</h1>{body}
-<footer>Written by <code>comvla-sim report</code>.</footer></main></body>
-</html>
-"""
+    return document(title, body, style=_PLOT_CSS, command="comvla-sim report")
 
 
 def data_uri(picture: bytes) -> str:
