@@ -7,7 +7,6 @@ import collections
 import math
 import random
 import socket
-import struct
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +19,8 @@ from comvla.model_info import ModelInfo
 from comvla.v1 import policy_pb2
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
-from comvla_server.service import STATUS
+from comvla_server.statuses import STATUS
+from comvla_sim.fuzz.mutations import TOKEN_MUTATIONS, mutated_bytes
 from comvla_vla import random_policy
 
 REQUESTS = 10_500
@@ -28,10 +28,6 @@ CONCURRENCY = 32
 DOCUMENTED = {grpc.StatusCode.OK, *STATUS.values()}
 # A mutated request breaks neither the server nor the model, so it is never the server's fault.
 EXPECTED = DOCUMENTED - {grpc.StatusCode.INTERNAL, grpc.StatusCode.UNAVAILABLE}
-
-TEXTS = ("", " ", "open it", "\x00", "a" * 3000, "ж" * 500, "a\r\nb", "%s%n{}", "../..", "\u202e")
-FLOATS = (0.0, -0.0, math.nan, math.inf, -math.inf, 1e38, -1e38, 1e-45, 1.0)
-INTEGERS = (0, 1, 2, 7, 255, 256, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
 
 
 def mutated_message(rng: random.Random, info: ModelInfo, instructions: Sequence[str]) -> bytes:
@@ -45,73 +41,8 @@ def mutated_message(rng: random.Random, info: ModelInfo, instructions: Sequence[
         instruction=rng.choice(instructions),
     )
     for _ in range(rng.randint(1, 3)):
-        rng.choice(FIELD_MUTATIONS)(request, rng)
+        rng.choice(TOKEN_MUTATIONS)(request, rng)
     return request.SerializeToString()
-
-
-def _text(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    name = rng.choice(("session_id", "instruction", "model_fingerprint"))
-    setattr(request, name, rng.choice(TEXTS))
-
-
-def _number(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    if rng.random() < 0.5:
-        request.step = rng.choice(INTEGERS)
-    else:
-        request.protocol_version = rng.choice(INTEGERS) % 2**32
-
-
-def _proprio(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    del request.proprio[:]
-    request.proprio.extend(rng.choice(FLOATS) for _ in range(rng.choice((0, 1, 2, 2, 2, 3, 500))))
-
-
-def _link(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    request.snr_db = rng.choice(FLOATS)
-    request.snr_age_s = rng.choice(FLOATS)
-
-
-def _payload(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    request.payload = mutated_bytes(request.payload, rng)
-
-
-def _payload_header(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    """Lies in the header: version, quantization, towers, widths, counts."""
-    content = bytearray(request.payload)
-    at = rng.randrange(4, 16)
-    content[at : at + 2] = struct.pack("<H", rng.choice((0, 1, 2, 8, 16, 255, 4096, 65535)))
-    request.payload = bytes(content)
-
-
-def _payload_values(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    """Not finite or huge where a scale or a value may be."""
-    content = bytearray(request.payload)
-    if len(content) > 24:
-        at = rng.randrange(16, len(content) - 4)
-        content[at : at + 4] = struct.pack("<f", rng.choice(FLOATS))
-    request.payload = bytes(content)
-
-
-FIELD_MUTATIONS = (_text, _number, _proprio, _link, _payload, _payload_header, _payload_values)
-
-
-def mutated_bytes(data: bytes, rng: random.Random) -> bytes:
-    """Flipped, cut, doubled, inserted or replaced bytes."""
-    content = bytearray(data)
-    for _ in range(rng.randint(1, 4)):
-        at = rng.randrange(len(content) + 1)
-        match rng.randrange(5):
-            case 0 if content:
-                content[at % len(content)] ^= 1 << rng.randrange(8)
-            case 1:
-                del content[at:]
-            case 2:
-                content[at:at] = content[: rng.randrange(64)]
-            case 3:
-                content[at:at] = rng.randbytes(rng.randrange(16))
-            case _:
-                content[at : at + 4] = rng.randbytes(4)
-    return bytes(content)
 
 
 def hostile(rng: random.Random, info: ModelInfo, instructions: Sequence[str]) -> bytes:

@@ -46,7 +46,7 @@ def mutated_fields(rng: random.Random) -> bytes:
     """One to three fields replaced."""
     request = plain_request(rng)
     for _ in range(rng.randint(1, 3)):
-        rng.choice(_OF_TOKENS)(request, rng)
+        rng.choice(TOKEN_MUTATIONS)(request, rng)
     return request.SerializeToString()
 
 
@@ -60,9 +60,9 @@ def mutated_pictures(rng: random.Random) -> bytes:
         rows, columns = INFO.image_size
         request.images.views.add(data=data, height=rows, width=columns)
     for _ in range(rng.randint(0, 2)):
-        rng.choice(_OF_PICTURES)(request, rng)
+        rng.choice(_PICTURE_MUTATIONS)(request, rng)
     if rng.random() < 0.1:
-        rng.choice(_OF_TOKENS)(request, rng)
+        rng.choice(TOKEN_MUTATIONS)(request, rng)
     return request.SerializeToString()
 
 
@@ -128,7 +128,8 @@ def _number(request: policy_pb2.InferRequest, rng: random.Random) -> None:
 
 
 def _proprio(request: policy_pb2.InferRequest, rng: random.Random) -> None:
-    length = rng.choice((0, 1, 4, 4, 4, 4, 5, 500))
+    right = len(request.proprio)
+    length = rng.choice((0, 1, right, right, right, right, right + 1, 500))
     request.proprio[:] = [rng.choice(FLOATS) for _ in range(length)]
 
 
@@ -219,7 +220,7 @@ def _bomb(request: policy_pb2.InferRequest, rng: random.Random) -> None:
         view.data = encode_still("jpeg", np.zeros((side, side, 3), np.uint8), 50)
 
 
-_OF_TOKENS: tuple[Mutation, ...] = (
+TOKEN_MUTATIONS: tuple[Mutation, ...] = (
     _text,
     _number,
     _proprio,
@@ -230,7 +231,9 @@ _OF_TOKENS: tuple[Mutation, ...] = (
     _payload_records,
     _both,
 )
-_OF_PICTURES: tuple[Mutation, ...] = (
+"""What may be wrong with a request of tokens."""
+
+_PICTURE_MUTATIONS: tuple[Mutation, ...] = (
     _view_file,
     _view_file,
     _view_size,
