@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from eval_stubs import ListeningTransport
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +17,6 @@ from comvla.errors import LinkError
 from comvla_client import TransportError
 from comvla_client.sending import POLICIES
 from comvla_server.vision import VisionHalf
-from comvla_sim import worlds
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.in_process import InProcessTransport
 from comvla_sim.experiments.link_case import (
@@ -34,27 +31,12 @@ from comvla_sim.experiments.over_link import EpisodeLink
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
 from comvla_sim.experiments.rollout import run_episode
 from comvla_sim.worlds import World
-from comvla_vla import CloudModel, EdgeModel, random_policy
+from comvla_vla import CloudModel, EdgeModel
 
 SETTINGS = EvalSettings(model="random", seed=7)
 LINK = LinkCase("rician", 5.0, 1, "drop", bandwidth_hz=0.18e6)
 SPEC = EpisodeSpec("normal", "hard_voting", None, "drawer-open", 0, LINK)
 STEPS = 40
-
-
-@pytest.fixture(scope="module")
-def policy() -> Iterator[tuple[EdgeModel, CloudModel]]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # so small a model only waits for its threads
-    yield random_policy(seed=0)
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def long_world() -> Iterator[World]:
-    world = worlds.make("tabletop")
-    yield world
-    world.close()
 
 
 @pytest.fixture

@@ -2,43 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from eval_stubs import ExpertCloud, ListeningTransport
 
-from comvla_sim import worlds
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.in_process import InProcessTransport
 from comvla_sim.experiments.observing import ObservedEdge, token_at
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
 from comvla_sim.experiments.rollout import cast, expert_pictures, run_episode
 from comvla_sim.worlds import World
-from comvla_vla import CloudModel, EdgeModel, random_policy
+from comvla_vla import CloudModel, EdgeModel
 
 pytestmark = pytest.mark.simulator
 
 SETTINGS = EvalSettings(model="random", seed=7)
 SPEC = EpisodeSpec("normal", "hard_voting", 16, "drawer-open", 0)
-
-
-@pytest.fixture(scope="module")
-def policy() -> Iterator[tuple[EdgeModel, CloudModel]]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # so small a model only waits for its threads
-    yield random_policy(seed=0)
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def long_world() -> Iterator[World]:
-    world = worlds.make("tabletop")
-    yield world
-    world.close()
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ from comvla_sim.netlink.realtime import EMULATED, prefer_this_thread, settle, wa
 from comvla_sim.netlink.synthetic import INSTRUCTION, SyntheticEdge, observation
 
 ALLOWED_PERIODS = 2.0
+_UNDISTURBED_S = 1.0  # before the first flap and after the last
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def run(
         connected(_serve_robot, link.robot, target, parameters, profile) as (robot, _),
     ):
         link.shape(profile.capacity_bits(parameters.snr_db) / 8 / profile.period_s)
-        time.sleep(1.0)
+        time.sleep(_UNDISTURBED_S)
         for number in range(parameters.count):
             time.sleep(parameters.between_s * dice.uniform(0.5, 1.5))
             # Evenly over the logarithm: as many below half a second as above.
@@ -101,7 +102,7 @@ def run(
             link.set_up_down(True, at=parameters.at)
             gaps.append((down, time.monotonic()))
             on_flap(number + 1)
-        time.sleep(1.0)
+        time.sleep(_UNDISTURBED_S)
         steps = _steps(robot)
     flaps = [_flap(down, up, steps, profile.period_s) for down, up in gaps]
     return {
