@@ -14,6 +14,10 @@ from comvla_server.refusals import Reason, Refusal
 _LEAST_TIME_S = 0.02
 """Whoever arrives with less cannot count on an answer, whatever the model."""
 
+_EARLY = (
+    0.1  # of its time: the client's deadline comes before the server's, by the way to the server
+)
+
 
 class Screening:
     """Turns calls away unread where the event loop hardly keeps up, and learns from what became of the others.
@@ -76,11 +80,13 @@ class Screening:
             request: who asked.
             time_remaining_s: seconds that it had when it was first seen, None where it did not say.
         """
+        began_s = self._clock()
         died = False
         try:
             return await answer
         except asyncio.CancelledError:
-            died = True
+            # A client that asked over two connections takes back the slower call: that one is no loss.
+            died = _was_over(time_remaining_s, self._clock() - began_s)
             raise
         except Refusal as refusal:
             died = refusal.reason is Reason.DEADLINE
@@ -105,3 +111,10 @@ class Screening:
         """Seconds in which no model can be expected to answer, however idle."""
         usual_s = min((runtime.batcher.usual_s for runtime in self._models), default=0.0)
         return max(_LEAST_TIME_S, usual_s)
+
+
+def _was_over(time_remaining_s: float | None, passed_s: float) -> bool:
+    """Whether a call that its client gave up had come to its deadline."""
+    if time_remaining_s is None:
+        return False
+    return passed_s >= time_remaining_s - max(_LEAST_TIME_S, _EARLY * time_remaining_s)

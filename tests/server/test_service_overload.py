@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from server_stubs import Robot, StubCloud, eventually, message
 
 from comvla.load_hints import LoadHints
+from comvla.v1 import policy_pb2
 from comvla_server.background import BackgroundServer
 from comvla_server.cost_model import CostModel, Work
 from comvla_server.engine import Engine
@@ -21,6 +23,7 @@ from comvla_server.load_control import LoadControl
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.loop_watch import LoopWatch
 from comvla_server.metrics import Metrics
+from comvla_server.models import Models
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.screening import Screening
 from comvla_server.settings import ServerSettings
@@ -244,6 +247,30 @@ def test_a_call_with_less_time_than_any_answer_takes_is_hopeless(
     service.screening.note_lost("arm-8", 1.0)
     service.screening.note_lost("arm-9", None)
     assert noted == [("arm-7", True), ("arm-8", False), ("arm-9", False)]
+
+
+@pytest.mark.parametrize(
+    ("given_s", "given_up_after_s", "died"),
+    [(1.0, 0.3, False), (1.0, 0.95, True), (0.1, 0.09, True), (None, 5.0, False)],
+)
+def test_a_call_taken_back_before_its_deadline_is_no_loss(
+    given_s: float | None, given_up_after_s: float, died: bool
+) -> None:
+    now_s = 100.0
+    screening = Screening(Models(), admission=True, clock=lambda: now_s)
+    noted: list[bool] = []
+    screening.loop_watch.note = (  # type: ignore[method-assign]
+        lambda *, died, who="", hopeless=False: noted.append(died)
+    )
+
+    async def given_up() -> policy_pb2.InferResponse:
+        nonlocal now_s
+        now_s += given_up_after_s
+        raise asyncio.CancelledError
+
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(screening.watched(given_up(), policy_pb2.InferRequest(), given_s))
+    assert noted == [died]
 
 
 def test_a_glance_asks_every_model_that_a_call_may_mean() -> None:

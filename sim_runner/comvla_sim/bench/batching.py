@@ -130,7 +130,8 @@ class _Fleet:
 
 @contextmanager
 def _fleet(parameters: BatchingParameters, max_batch: int) -> Iterator[_Fleet]:
-    arguments = (parameters.model, max_batch, parameters.threads)
+    # What batches are worth is measured here, not whom a server turns away that cannot keep up.
+    arguments = (parameters.model, max_batch, parameters.threads, {"admission": False})
     with ExitStack() as stack:
         addresses = stack.enter_context(serving(policy_server.serve, *arguments))
         target, admin_url = addresses.split()
