@@ -37,6 +37,7 @@ class Admission:
 
     Attributes:
         lag_s: how long answers take lately from the model to the network, seconds.
+        turn_s: what other models take between two passes of this one, seconds.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class Admission:
         self._shares = shares
         self._policy = policy
         self._max_batch = max_batch
-        self.lag_s = 0.0
+        self.lag_s = self.turn_s = 0.0
 
     def order(self, waiting: Sequence[Place]) -> list[Place]:
         """Who is computed first: whose place is due first, else in order of arrival."""
@@ -68,7 +69,9 @@ class Admission:
         margin_s = self._policy.deadline_margin_s + self.lag_s
         for passes, start in enumerate(range(0, len(ordered), self._max_batch), 1):
             batch = ordered[start : start + self._max_batch]
-            free_s += self._costs.predict(Work.of([place.work for place in batch]))
+            # What other models compute now is part of free_s; before each later pass comes their turn again.
+            turn_s = self.turn_s if passes > 1 else 0.0
+            free_s += turn_s + self._costs.predict(Work.of([place.work for place in batch]))
             # Misses of several passes cancel out in part.
             spread_s = math.sqrt(passes) * self._costs.spread_s
             times += [free_s + spread_s + margin_s] * len(batch)

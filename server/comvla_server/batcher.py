@@ -18,6 +18,7 @@ from comvla_server.inference_thread import InferenceThread
 from comvla_server.load_control import LoadControl
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
+from comvla_server.occupancy import Occupancy
 from comvla_server.passes import Pass, run_pass
 from comvla_server.refusals import Reason, Refusal
 from comvla_server.sessions import Session, SessionTable, superseded
@@ -33,7 +34,8 @@ class Batcher:
     whose deadline is nearest is computed first (:mod:`comvla_server.admission`). A ticket whose
     deadline has passed, or for which nobody waits any more, is dropped before it costs compute.
 
-    Nothing is shared between batchers: a process may have one for each of its models.
+    A process may have one for each of its models; they share what they are given, the inference
+    thread and what it has before it.
 
     Args:
         engine: runs the batches.
@@ -45,6 +47,7 @@ class Batcher:
         costs: what passes cost; what the engine has learned where None.
         metrics: where batches, compute and failures are counted.
         thread: the inference thread; a new one where none is given.
+        occupancy: of that thread.
         clock: monotonic seconds.
     """
 
@@ -60,6 +63,7 @@ class Batcher:
         costs: CostModel | None = None,
         metrics: Metrics | None = None,
         thread: InferenceThread | None = None,
+        occupancy: Occupancy | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._engine = engine
@@ -75,6 +79,7 @@ class Batcher:
             load or LoadPolicy(),
             engine.costs if costs is None else costs,
             self._metrics,
+            occupancy,
         )
         # Sessions with an observation that waits, in order of arrival. A newer observation replaces
         # the older one in its session, so the session keeps its place in the queue.
@@ -289,6 +294,7 @@ class Batcher:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._task
+        self._load.close()
         for session in self._sessions:
             for ticket in (session.queued, session.running):
                 if ticket is not None:

@@ -11,6 +11,7 @@ from comvla_server.cost_model import CostModel, Work
 from comvla_server.fairness import FairShares
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
+from comvla_server.occupancy import Occupancy
 from comvla_server.offered_load import OfferedLoad
 from comvla_server.refusals import Refusal
 from comvla_server.tickets import Place
@@ -32,6 +33,7 @@ class LoadControl:
         policy: what is switched on.
         costs: what passes cost, perhaps calibrated already.
         metrics: where predictions go.
+        occupancy: of the inference thread, which other models may share.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class LoadControl:
         policy: LoadPolicy,
         costs: CostModel,
         metrics: Metrics,
+        occupancy: Occupancy | None = None,
     ) -> None:
         self._costs = costs
         self._shares = FairShares()
@@ -48,7 +51,8 @@ class LoadControl:
         self._admission = Admission(costs, self._shares, policy, max_batch)
         self._metrics = metrics
         self._busy = BusyMeter()
-        self._running: tuple[float, float] | None = None
+        self._occupancy = occupancy or Occupancy()
+        self._occupancy.join(self, self._offered.load)
         self._lag_s = 0.0
         self._lagged_s = 0.0
 
@@ -71,12 +75,13 @@ class LoadControl:
             Refusal: it would be late, make another late, or is above its fair share.
         """
         self._admission.lag_s = self.lag_s(now_s)
+        self._admission.turn_s = self._occupancy.turn_s(self)
         return self._admission.require(
             place,
             waiting,
             self.free_s(now_s),
             now_s,
-            overloaded=self.load(now_s) > 1.0,
+            overloaded=self._occupancy.load(now_s) > 1.0,
             replaces=replaces,
         )
 
@@ -124,7 +129,7 @@ class LoadControl:
     def begin(self, work: Work, now_s: float) -> None:
         """A pass starts."""
         self._busy.begin(now_s)
-        self._running = (now_s, self._costs.predict(work))
+        self._occupancy.begin(self, self._costs.predict(work), now_s)
 
     def end(self, work: Work, ready_s: float, now_s: float, *, succeeded: bool) -> None:
         """A pass ended.
@@ -137,9 +142,14 @@ class LoadControl:
             succeeded: whether it says anything about costs.
         """
         self._busy.end(now_s)
-        self._running = None
+        waited_until_s = self._occupancy.end(self, now_s)
         if succeeded:
-            self._costs.observe(work, now_s - ready_s)
+            # The passes of other models that it waited for are no cost of this one.
+            self._costs.observe(work, now_s - max(ready_s, waited_until_s))
+
+    def close(self) -> None:
+        """The model is gone."""
+        self._occupancy.leave(self)
 
     def note_lag(self, lag_s: float, now_s: float) -> None:
         """How long an answer took from the model to its caller."""
@@ -156,13 +166,8 @@ class LoadControl:
         return self._costs.predict(work)
 
     def free_s(self, now_s: float) -> float:
-        """When the model will be done with what it computes now; ``now_s`` where it rests."""
-        if self._running is None:
-            return now_s
-        started_s, predicted_s = self._running
-        elapsed_s = now_s - started_s
-        # What takes longer than expected may take as much longer again.
-        return now_s + max(predicted_s - elapsed_s, elapsed_s - predicted_s, 1e-6)
+        """When the next pass can begin; ``now_s`` where the inference thread rests."""
+        return self._occupancy.free_s(self, now_s)
 
     def usual_work(self) -> Work:
         """What requests of late took, on average."""
@@ -178,7 +183,8 @@ class LoadControl:
 
     def suggested_tokens(self, now_s: float) -> int:
         """Tokens that a request should have at most, 0 for no wish."""
-        return self._offered.advice(now_s)
+        whole = self._occupancy.load(now_s)
+        return self._offered.advice(now_s, self.load(now_s) / whole if whole > 0.0 else 1.0)
 
     def _note_asked(self, place: Place, now_s: float) -> None:
         if place.robot:

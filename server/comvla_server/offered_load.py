@@ -89,13 +89,18 @@ class OfferedLoad:
         cost_s = self._costs.request_cost_s(self._max_batch, tokens / requests, pictures / requests)
         return self.requests_per_s(now_s) * cost_s
 
-    def advice(self, now_s: float) -> int:
-        """Tokens that a request should have at most; 0 where the server has no wish."""
+    def advice(self, now_s: float, share: float = 1.0) -> int:
+        """Tokens that a request should have at most; 0 where the server has no wish.
+
+        Args:
+            now_s: the time.
+            share: of the inference thread that is this model's, by what is asked of all that use it.
+        """
         if self._active and now_s - self._advised_s >= _RENEW_AFTER_S:
-            self._advice, self._advised_s = self._level(now_s), now_s
+            self._advice, self._advised_s = self._level(now_s, share), now_s
         return self._advice
 
-    def _level(self, now_s: float) -> int:
+    def _level(self, now_s: float, share: float) -> int:
         rate = self.requests_per_s(now_s)
         token_s = self._costs.token_s
         if rate <= 0.0 or token_s <= 0.0 or len(self._wishes) < _FEWEST_WISHES:
@@ -107,7 +112,7 @@ class OfferedLoad:
             return 0
         picture_s = self._costs.picture_s + token_s * self._num_tokens
         fixed_s = self._costs.fixed_s / self._max_batch + self._costs.request_s
-        left_s = self._target / rate - fixed_s - pictures * picture_s
+        left_s = share * self._target / rate - fixed_s - pictures * picture_s
         mean_tokens = left_s / (token_s * (1.0 - pictures))
         wishes = np.sort(np.array(self._wishes, dtype=np.float64))
         if wishes.mean() <= mean_tokens:

@@ -11,6 +11,7 @@ from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
 from comvla_server.model_names import UNNAMED
 from comvla_server.models import Runtime
+from comvla_server.occupancy import Occupancy
 from comvla_server.settings import ServerSettings, SettingsError
 from comvla_server.validation import Validator
 
@@ -30,6 +31,7 @@ class Runtimes:
         self._settings = settings
         self._metrics = metrics
         self.thread = InferenceThread()
+        self._occupancy = Occupancy()
         self._decode_thread = InferenceThread("comvla-decode")
         self._decoding = Decoding(self._decode_thread, settings.max_queue)
 
@@ -53,6 +55,7 @@ class Runtimes:
             load=LoadPolicy.of(settings),
             metrics=self._metrics,
             thread=self.thread,
+            occupancy=self._occupancy,
         )
         batcher.start()
         validator = Validator(engine, settings.max_request_bytes, also)

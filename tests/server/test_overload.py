@@ -13,6 +13,7 @@ from comvla_server.cost_model import CostModel, Work
 from comvla_server.load_control import LoadControl
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
+from comvla_server.occupancy import Occupancy
 from comvla_server.refusals import Refusal
 from comvla_server.tickets import Place
 
@@ -38,61 +39,86 @@ def pass_s(work: Work, rng: random.Random) -> float:
     return usual_s * rng.uniform(0.9, 1.1)
 
 
-def simulate(load: float, policy: LoadPolicy, *, seconds: float = 30.0) -> list[Robot]:
-    """The batcher's rules on an event queue: arrivals, and the ends of passes. Advice is followed."""
+@dataclass
+class Model:
+    """The batcher's rules for one model: who waits, who is computed."""
+
+    control: LoadControl
+    queue: dict[int, Place] = field(default_factory=dict)
+    running: list[tuple[int, Place]] = field(default_factory=list)
+    work: Work = field(default_factory=lambda: Work(0, 0))
+    ready_s: float = 0.0
+
+
+def simulate(
+    load: float, policy: LoadPolicy, *, seconds: float = 30.0, models: int = 1
+) -> list[Robot]:
+    """Arrivals and the ends of passes on an event queue. Advice is followed; models share a thread."""
     rng = random.Random(0)
-    control = LoadControl(BATCH, N, policy, CostModel(), Metrics())
+    occupancy = Occupancy()
+    served = [
+        Model(LoadControl(BATCH, N, policy, CostModel(), Metrics(), occupancy))
+        for _ in range(models)
+    ]
     robots = [Robot() for _ in range(ROBOTS)]
-    queue: dict[int, Place] = {}
-    running: list[tuple[int, Place]] = []
-    work, ready_s = Work(0, 0), 0.0
+    thread: list[Model] = []  # the first is computed, the others wait for it
     period_s = ROBOTS / (load * CAPACITY)
     numbers = itertools.count()
     events = [(rng.random() * period_s, next(numbers), robot) for robot in range(ROBOTS)]
     heapq.heapify(events)
+
+    def compute(now_s: float) -> None:
+        heapq.heappush(events, (now_s + pass_s(thread[0].work, rng), next(numbers), -1))
+
     while events[0][0] < seconds:
         now_s, _, robot = heapq.heappop(events)
         counted = now_s > 5.0
         if robot < 0:  # a pass ended
-            control.end(work, ready_s, now_s, succeeded=True)
-            for index, place in running:
+            model = thread.pop(0)
+            model.control.end(model.work, model.ready_s, now_s, succeeded=True)
+            for index, place in model.running:
                 if now_s <= place.deadline_s:
                     robots[index].answered += counted
                 else:
                     robots[index].late += counted
-            running = []
+            model.running = []
+            if thread:
+                compute(now_s)
         else:
+            model = served[robot % models]
             robots[robot].offered += counted
-            k = min(128, control.suggested_tokens(now_s) or N)
+            k = min(128, model.control.suggested_tokens(now_s) or N)
             robots[robot].tokens.append(k)
             due_s = now_s + DEADLINE_S
             place = Place(str(robot), Work(1, k), due_s, due_s)
-            older = queue.get(robot)
+            older = model.queue.get(robot)
             if older is not None:
                 place.due_s = older.due_s
-            waiting = [p for index, p in queue.items() if index != robot]
+            waiting = [p for index, p in model.queue.items() if index != robot]
             try:
-                control.let_in(place, waiting, now_s, replaces=older is not None)
-                queue[robot] = place
+                model.control.let_in(place, waiting, now_s, replaces=older is not None)
+                model.queue[robot] = place
             except Refusal:
                 pass
             again_s = now_s + period_s * rng.uniform(0.9, 1.1)
             heapq.heappush(events, (again_s, next(numbers), robot))
-        if running or not queue:
+        if model.running or not model.queue:
             continue
-        by_place = {id(place): index for index, place in queue.items()}
-        for place in control.order(list(queue.values())):
+        by_place = {id(place): index for index, place in model.queue.items()}
+        for place in model.control.order(list(model.queue.values())):
             index = by_place[id(place)]
             if place.deadline_s <= now_s:
                 robots[index].late += counted
-                del queue[index]
-            elif len(running) < BATCH:
-                running.append((index, place))
-                del queue[index]
-        if running:
-            work, ready_s = Work.of(place.work for _, place in running), now_s
-            control.begin(work, now_s)
-            heapq.heappush(events, (now_s + pass_s(work, rng), next(numbers), -1))
+                del model.queue[index]
+            elif len(model.running) < BATCH:
+                model.running.append((index, place))
+                del model.queue[index]
+        if model.running:
+            model.work, model.ready_s = Work.of(p.work for _, p in model.running), now_s
+            model.control.begin(model.work, now_s)
+            thread.append(model)
+            if len(thread) == 1:
+                compute(now_s)
     return robots
 
 
@@ -105,9 +131,10 @@ OFF = LoadPolicy(
 )
 
 
+@pytest.mark.parametrize("models", [1, 2])
 @pytest.mark.parametrize("load", [1.5, 10.0])
-def test_who_is_let_in_is_answered_in_time_and_nobody_starves(load: float) -> None:
-    robots = simulate(load, LoadPolicy(advise_tokens=False))
+def test_who_is_let_in_is_answered_in_time_and_nobody_starves(load: float, models: int) -> None:
+    robots = simulate(load, LoadPolicy(advise_tokens=False), models=models)
     answered, late = sum(r.answered for r in robots), sum(r.late for r in robots)
     assert answered / (answered + late) >= 0.99
     assert answered / 25.0 >= 0.9 * CAPACITY
@@ -120,8 +147,11 @@ def test_without_admission_the_same_robots_wait_and_die() -> None:
     assert sum(r.answered for r in off) < sum(r.answered for r in on)
 
 
-def test_fewer_tokens_serve_more_robots_in_time() -> None:
-    plain, advised = (simulate(1.5, LoadPolicy(advise_tokens=advise)) for advise in (False, True))
+@pytest.mark.parametrize("models", [1, 2])
+def test_fewer_tokens_serve_more_robots_in_time(models: int) -> None:
+    plain, advised = (
+        simulate(1.5, LoadPolicy(advise_tokens=advise), models=models) for advise in (False, True)
+    )
     shares = [
         sum(r.answered for r in robots) / sum(r.offered for r in robots)
         for robots in (plain, advised)
@@ -134,7 +164,8 @@ def test_fewer_tokens_serve_more_robots_in_time() -> None:
     assert max(late) - min(late) < 25  # and the advice does not swing
 
 
-def test_below_capacity_nobody_is_turned_away() -> None:
-    robots = simulate(0.7, LoadPolicy())
+@pytest.mark.parametrize("models", [1, 2])
+def test_below_capacity_nobody_is_turned_away(models: int) -> None:
+    robots = simulate(0.7, LoadPolicy(), models=models)
     assert all(r.answered >= r.offered - 2 for r in robots)  # the last ones are still under way
     assert {k for robot in robots for k in robot.tokens} == {128}
