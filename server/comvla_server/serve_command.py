@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import gc
 import logging
 import os
 import signal
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from comvla_server import logs
 from comvla_server.descriptors import allow_descriptors
 from comvla_server.model_loading import load_engine
+from comvla_server.process import settle, take_turns
 from comvla_server.settings import ServerSettings
 from comvla_server.settings_flags import add_flags, settings_of
 
@@ -73,11 +73,12 @@ def run(args: argparse.Namespace) -> int:
 async def _serve(settings: ServerSettings, loads: Mapping[str, Callable[[], Engine]]) -> int:
     from comvla_server.server import Server
 
+    take_turns()
     stop = _stop_on_signals()
     server = Server(loads, settings, sources=settings.models)
     await server.bind()
     _refresh_on_hangup(server)
-    ready = asyncio.create_task(server.make_ready(_settle))
+    ready = asyncio.create_task(server.make_ready(settle))
     stopping = asyncio.create_task(stop.wait())
     lost = asyncio.create_task(server.port_lost.wait())
     try:
@@ -100,13 +101,6 @@ async def _serve(settings: ServerSettings, loads: Mapping[str, Callable[[], Engi
         with contextlib.suppress(asyncio.CancelledError):
             await ready
     return 0 if finished and not server.port_lost.is_set() else 1
-
-
-def _settle() -> None:
-    """What was loaded stays: a garbage collection that walks through all of torch would halt every
-    robot for a quarter of a second, once in some hundred requests. So would this one, if it came later."""
-    gc.collect()
-    gc.freeze()
 
 
 def _stop_on_signals() -> asyncio.Event:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from comvla.model_info import ModelInfo
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import CloudHalf, Engine
+from comvla_server.process import settle, take_turns
 from comvla_server.settings import ServerSettings
 from comvla_sim.bench.processes import announce, wait_for_end
 from comvla_sim.bench.stub_model import StubModel
@@ -71,7 +72,9 @@ def serve(
         settings: of the server, where they differ from its defaults.
     """
     chosen = ServerSettings(max_batch=max_batch, **(settings or {}))
+    take_turns()
     with BackgroundServer(Engine(_cloud_half(model, threads)), chosen) as server:
+        settle()
         announce(lifeline, f"{server.target} {server.admin_url}")
         wait_for_end(lifeline)
 
