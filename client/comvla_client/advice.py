@@ -13,15 +13,17 @@ _FIRST_SHARE = 0.25
 
 
 class TokenAdvice:
-    """The server's upper bound on K, as long as it repeats it.
+    """The server's upper bound on K, until it has no such wish any more.
 
-    A new hint holds at once. When hints cease, because the server has no wish any more or does not
-    answer, the bound doubles every ``recovery_s`` until it bounds nothing: a server that was just
-    relieved is not met by everybody's full K at the same moment.
+    A new hint holds at once, also for a robot that asks but once in some seconds. After an answer
+    without one, or when nothing was heard for ``hold_s``, the bound doubles every ``recovery_s``
+    until it bounds nothing: a server that was just relieved is not met by everybody's full K at
+    the same moment.
 
     Args:
         num_tokens: N.
-        recovery_s: time in which a bound that is not repeated doubles, seconds.
+        recovery_s: time in which a bound that is not wished any more doubles, seconds.
+        hold_s: how long a wish holds when nothing is heard, seconds.
         clock: monotonic seconds.
     """
 
@@ -30,26 +32,36 @@ class TokenAdvice:
         num_tokens: int,
         *,
         recovery_s: float = 1.0,
+        hold_s: float = 5.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._num_tokens = num_tokens
         self._recovery_s = recovery_s
+        self._hold_s = hold_s
         self._clock = clock
         self._bound: int | None = None
-        self._heard_s = 0.0
+        self._holds_until_s = 0.0
 
     def hear(self, suggested_tokens: int) -> None:
-        """Takes note of the hint of an answer or a refusal; 0 is no wish."""
+        """Takes note of the hint of an answer; 0 is no wish."""
+        now_s = self._clock()
         if suggested_tokens > 0:
-            self._bound, self._heard_s = suggested_tokens, self._clock()
+            self._bound, self._holds_until_s = suggested_tokens, now_s + self._hold_s
+        else:
+            self._holds_until_s = min(self._holds_until_s, now_s)
+
+    def hear_refusal(self, suggested_tokens: int) -> None:
+        """Takes note of the hint of a call without an answer, whose silence says nothing of the server's wishes."""
+        if suggested_tokens > 0:
+            self.hear(suggested_tokens)
 
     @property
     def most_tokens(self) -> int | None:
         """Tokens that a step should send at most; None where nothing bounds it."""
         if self._bound is None:
             return None
-        doublings = min(32.0, (self._clock() - self._heard_s) / self._recovery_s)
-        bound = int(self._bound * 2.0**doublings)
+        faded_s = max(0.0, self._clock() - self._holds_until_s)
+        bound = int(self._bound * 2.0 ** min(32.0, faded_s / self._recovery_s))
         if bound >= self._num_tokens:
             self._bound = None
             return None

@@ -309,7 +309,7 @@ class ClientCore:
             self._form.settle(prepared.request.step, False)
         reason = prepared.reason if error is None else fallback_reason(error)
         if error is not None:
-            self._planner.advice.hear(error.hints.suggested_tokens)
+            self._planner.advice.hear_refusal(error.hints.suggested_tokens)
             if reason == "overloaded":
                 self._back_off.refused(error.hints.retry_after_s)
         detail = prepared.plan.detail if error is None else error.message

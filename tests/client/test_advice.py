@@ -106,6 +106,35 @@ def test_the_bound_is_lifted_step_by_step_when_hints_cease(clock: Clock) -> None
     assert sent == [4, 8, 16, 18, 18]
 
 
+def test_a_wish_holds_for_a_robot_that_asks_but_once_in_seconds(clock: Clock) -> None:
+    transport = StubTransport(suggesting(4), suggesting(4))
+    with ComVLAClient(transport, **options()) as client:
+        sent = []
+        for _ in range(4):
+            sent.append(client.step(OBS, WORDS, 10.0).report.tokens)
+            clock.now_s += 3.0
+    assert sent == [18, 4, 4, 18]  # the third answer has no wish: after it three seconds lift all
+
+
+def test_silence_lifts_the_bound_later_than_an_answer_without_a_wish(clock: Clock) -> None:
+    advice = TokenAdvice(512, clock=clock)
+    advice.hear(16)
+    advice.hear_refusal(0)
+    clock.now_s += 4.9
+    assert advice.most_tokens == 16
+    clock.now_s += 2.1
+    assert advice.most_tokens == 64
+    advice.hear_refusal(20)
+    assert advice.most_tokens == 20
+    advice.hear(0)
+    clock.now_s += 1.0
+    advice.hear(0)
+    clock.now_s += 1.0
+    assert advice.most_tokens == 80
+    clock.now_s += 10.0
+    assert advice.most_tokens is None
+
+
 def test_the_latest_hint_holds_whether_it_is_lower_or_higher(clock: Clock) -> None:
     transport = StubTransport(suggesting(9), suggesting(3), suggesting(12))
     with ComVLAClient(transport, **options()) as client:

@@ -240,7 +240,7 @@ class _Robot:
         except grpc.aio.AioRpcError as error:
             code = error.code().name
             hints = LoadHints.from_metadata(error.trailing_metadata())
-            self.advice.hear(hints.suggested_tokens)
+            self.advice.hear_refusal(hints.suggested_tokens)
             if code == "RESOURCE_EXHAUSTED":
                 self.back_off.refused(hints.retry_after_s)
         else:
