@@ -27,6 +27,7 @@ KNOWN_END = "ended gRPC (known)"
 _KNOWN = UnicodeDecodeError.__name__
 _BATCH = 24
 _PATIENCE_S = 20.0
+_COME_AGAIN_S = 0.1
 # A connection whose frames no longer fit together waits for bytes that never come; so long is waited
 # for a last word of the server.
 _LAST_WORD_S = 0.03
@@ -82,21 +83,31 @@ async def _search(batch: Sequence[Case], server: SupervisedServer, tally: Tally,
             server.restart()
         tally.ended("frames", how)
     if not found:
-        what = f"the server ended ({why or what}), and outlived the same connections one by one"
+        what = (
+            f"the server was unwell ({why or what}), and outlived the same connections one by one"
+        )
         tally.fail(f"{batch[0]} to {batch[-1]}", "frames", what)
 
 
 async def _unwell(target: str) -> str:
     """What is wrong with the answer to somebody else's valid request; empty where nothing is."""
     request = valid_request("bystander", 0, payload(8, "float32"))
+    until_s = time.monotonic() + _PATIENCE_S
     async with grpc.aio.insecure_channel(target, options=list(codec.GRPC_OPTIONS)) as channel:
-        try:
-            response = await policy_pb2_grpc.PolicyServiceStub(channel).Infer(
-                request, timeout=_PATIENCE_S
-            )
-        except grpc.aio.AioRpcError as error:
-            return f"somebody else's request was answered {error.code().name}: {error.details()}"
-    return wrong_with(response, request)
+        stub = policy_pb2_grpc.PolicyServiceStub(channel)
+        while True:
+            try:
+                response = await stub.Infer(request, timeout=_PATIENCE_S)
+            except grpc.aio.AioRpcError as error:
+                # A crowded server may ask anybody to come again.
+                crowded = error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+                if crowded and time.monotonic() < until_s:
+                    await asyncio.sleep(_COME_AGAIN_S)
+                    continue
+                return (
+                    f"somebody else's request was answered {error.code().name}: {error.details()}"
+                )
+            return wrong_with(response, request)
 
 
 async def _connection(case: Case, target: str) -> str:
