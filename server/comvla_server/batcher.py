@@ -13,16 +13,16 @@ from collections.abc import Callable, Sequence
 
 from comvla_server.cost_model import CostModel, Work
 from comvla_server.engine import Engine
-from comvla_server.identity import caller
 from comvla_server.inference_thread import InferenceThread
 from comvla_server.load_control import LoadControl
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
 from comvla_server.occupancy import Occupancy
-from comvla_server.passes import Pass, run_pass
+from comvla_server.passes import Passes
 from comvla_server.refusals import Reason, Refusal
-from comvla_server.sessions import Session, SessionTable, superseded
-from comvla_server.tickets import Answer, Place, Ticket
+from comvla_server.sessions import Session, SessionTable
+from comvla_server.tickets import Answer, Ticket
+from comvla_server.waiting_room import WaitingRoom, too_late
 from comvla_vla.request import AnyRequest, ImageRequest
 
 
@@ -68,22 +68,19 @@ class Batcher:
     ) -> None:
         self._engine = engine
         self._max_batch = max_batch
-        self._max_queue = max_queue
         self._sessions = SessionTable(max_sessions, session_ttl_s)
-        self._metrics = metrics or Metrics()
-        self._thread = thread or InferenceThread()
         self._clock = clock
+        metrics = metrics or Metrics()
         self._load = LoadControl(
             max_batch,
             engine.info.num_tokens,
             load or LoadPolicy(),
             engine.costs if costs is None else costs,
-            self._metrics,
+            metrics,
             occupancy,
         )
-        # Sessions with an observation that waits, in order of arrival. A newer observation replaces
-        # the older one in its session, so the session keeps its place in the queue.
-        self._queue: dict[str, Session] = {}
+        self._passes = Passes(engine, thread or InferenceThread(), self._load, metrics, clock)
+        self._waiting = WaitingRoom(max_queue, self._load)
         self._work = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
@@ -99,7 +96,7 @@ class Batcher:
     @property
     def queue_depth(self) -> int:
         """Requests that wait."""
-        return len(self._queue)
+        return len(self._waiting)
 
     @property
     def utilization(self) -> float:
@@ -159,21 +156,11 @@ class Batcher:
         if session is not None and step <= session.newest_step:
             return  # find() will tell
         work = Work(1, num_tokens, int(pictures))
-        self._let_in(session_id, work, deadline_s, now_s, self._load.screen)
+        self._waiting.screen(session_id, work, deadline_s, now_s)
 
     def glance(self, deadline_s: float) -> Refusal | None:
         """Whether one more request like those of late could be answered in time; None where it could."""
-        now_s = self._clock()
-        work = self._load.usual_work()
-        place = Place("", work, deadline_s, deadline_s)
-        waiting = [s.queued.place for s in self._queue.values() if s.queued]
-        try:
-            self._load.predict(place, waiting, now_s, replaces=True)
-        except Refusal as late:
-            refusal = Refusal(Reason.CONGESTED, late.message, retry_after_s=late.retry_after_s)
-            refusal.suggested_tokens = self._load.suggested_tokens(now_s)
-            return refusal
-        return None
+        return self._waiting.glance(deadline_s, self._clock())
 
     def admit(
         self,
@@ -191,48 +178,13 @@ class Batcher:
         now_s = self._clock()
         pictures = isinstance(request, ImageRequest)
         work = Work(1, self._engine.num_tokens(request), int(pictures))
-        place = self._let_in(session_id, work, deadline_s, now_s, self._load.let_in)
+        place = self._waiting.let_in(session_id, work, deadline_s, now_s)
         session = self._sessions.touch(session_id, now_s)
         outcome = asyncio.get_running_loop().create_future()
         ticket = Ticket(session_id, step, digest, request, place, now_s, outcome)
-        if session.queued is not None:
-            session.queued.resolve(superseded(session_id, session.queued.step, step))
-        session.note_admitted(ticket)
-        self._queue[session_id] = session
+        self._waiting.seat(session, ticket)
         self._work.set()
         return ticket
-
-    def _let_in(
-        self,
-        session_id: str,
-        work: Work,
-        deadline_s: float,
-        now_s: float,
-        ask: Callable[..., object],
-    ) -> Place:
-        """The place of a new step, where there is one for it."""
-        older = self._queue.get(session_id)
-        if older is None and len(self._queue) >= self._max_queue:
-            refusal = Refusal(
-                Reason.OVERLOAD,
-                f"the queue is full: {len(self._queue)} of {self._max_queue} sessions wait for the "
-                "model; ask less often, send fewer tokens, or add a replica",
-                retry_after_s=max(0.001, self._load.free_s(now_s) - now_s),
-            )
-            self._load.note_full(now_s)
-            refusal.suggested_tokens = self._load.suggested_tokens(now_s)
-            raise refusal
-        place = Place(caller().name or session_id, work, deadline_s, deadline_s)
-        if older is not None and older.queued is not None:
-            # The newer observation may wait longer, but it is the robot's turn when it was before.
-            place.due_s = min(deadline_s, older.queued.place.due_s)
-        waiting = [s.queued.place for s in self._queue.values() if s.queued and s is not older]
-        try:
-            ask(place, waiting, now_s, replaces=older is not None)
-        except Refusal as refusal:
-            refusal.suggested_tokens = self._load.suggested_tokens(now_s)
-            raise
-        return place
 
     async def wait(self, ticket: Ticket, deadline_s: float) -> Answer:
         """The answer to a ticket. When its last caller leaves, a waiting ticket leaves the queue.
@@ -252,10 +204,9 @@ class Batcher:
             await asyncio.wait([ticket.outcome], timeout=remaining_s)
         finally:
             ticket.callers -= 1
-            session = self._queue.get(ticket.session_id)
-            if ticket.callers == 0 and session is not None and session.queued is ticket:
-                self._drop(session)
-        outcome = ticket.outcome.result() if ticket.outcome.done() else _too_late(ticket)
+            if ticket.callers == 0 and self._waiting.holds(ticket):
+                self._waiting.drop(ticket, self._clock())
+        outcome = ticket.outcome.result() if ticket.outcome.done() else too_late(ticket)
         if isinstance(outcome, Refusal):
             raise outcome
         if remaining_s:
@@ -299,103 +250,29 @@ class Batcher:
             for ticket in (session.queued, session.running):
                 if ticket is not None:
                     ticket.resolve(_cut_off(ticket))
-        self._queue.clear()
+        self._waiting.clear()
 
     async def _dispatch(self) -> None:
         while True:
             await self._work.wait()
             ready_s = self._clock()
             while batch := self._collect():
-                ready_s = await self._run(batch, ready_s)
+                ready_s = await self._passes.compute(batch, ready_s)
             self._work.clear()
 
     def _collect(self) -> list[Session]:
         """Sessions whose observation runs next; what came too late is dropped."""
-        places = {id(s.queued.place): s for s in self._queue.values() if s.queued is not None}
         batch: list[Session] = []
-        for place in self._load.order([s.queued.place for s in places.values() if s.queued]):
+        for ticket in self._waiting.in_turn():
             if len(batch) == self._max_batch:
                 break
-            session = places[id(place)]
-            if place.deadline_s <= self._clock():
-                self._drop(session)
+            if ticket.place.deadline_s <= self._clock():
+                self._waiting.drop(ticket, self._clock())
             else:
-                session.running = self._take(session)
+                session = self._waiting.take(ticket)
+                session.running = ticket
                 batch.append(session)
         return batch
-
-    def _take(self, session: Session) -> Ticket:
-        ticket = session.queued
-        assert ticket is not None, "a session in the queue has an observation that waits"
-        session.queued = None
-        del self._queue[session.session_id]
-        return ticket
-
-    def _drop(self, session: Session) -> None:
-        """Takes an observation that waits out of the queue, unanswered."""
-        ticket = self._take(session)
-        self._load.note_unanswered(ticket.place, self._clock())
-        ticket.resolve(_too_late(ticket))
-
-    async def _run(self, batch: list[Session], ready_s: float) -> float:
-        """One pass; returns when it ended."""
-        tickets = [s.running for s in batch if s.running]
-        requests = [ticket.request for ticket in tickets if ticket.request]
-        work = Work.of(ticket.place.work for ticket in tickets)
-        started_s = self._clock()
-        self._load.begin(work, started_s)
-        try:
-            passes = await self._thread.run(
-                run_pass, self._engine, requests, self._metrics, self._clock
-            )
-        except Exception as error:  # not even a SystemExit inside a model may end this loop
-            self._metrics.model_errors.inc()
-            passes = [Pass(error, len(batch), 0.0, 0.0)] * len(batch)
-        ended_s = self._clock()
-        succeeded = all(p.batch_size == len(batch) and p.ok for p in passes)
-        self._load.end(work, ready_s, ended_s, succeeded=succeeded)
-        self._metrics.inference_busy_seconds.inc(ended_s - started_s)
-        for session, outcome in zip(batch, passes, strict=True):
-            self._finish(session, outcome, started_s, ended_s)
-        return ended_s
-
-    def _finish(self, session: Session, outcome: Pass, started_s: float, ended_s: float) -> None:
-        ticket, session.running = session.running, None
-        assert ticket is not None
-        assert ticket.request is not None
-        if isinstance(outcome.result, Exception):
-            ticket.resolve(_model_failed(ticket, outcome.result))
-            return
-        answer = Answer(
-            actions=outcome.result,
-            tokens_used=self._engine.num_tokens(ticket.request),
-            batch_size=outcome.batch_size,
-            cloud_flops=outcome.flops,
-            queue_s=started_s - ticket.admitted_s,
-            predict_s=outcome.predict_s,
-            ready_s=ended_s,
-        )
-        self._metrics.inference_flops.inc(answer.cloud_flops)
-        self._metrics.step_phase.labels("queue").observe(answer.queue_s)
-        self._metrics.step_phase.labels("predict").observe(answer.predict_s)
-        self._metrics.unanswered_steps.inc(session.note_answered(ticket))
-        ticket.resolve(answer)
-
-
-def _too_late(ticket: Ticket) -> Refusal:
-    return Refusal(
-        Reason.DEADLINE,
-        f"step {ticket.step} was not computed within its deadline: expected an answer before it, "
-        "none came; allow more time, send fewer tokens, or add a replica",
-    )
-
-
-def _model_failed(ticket: Ticket, error: Exception) -> Refusal:
-    return Refusal(
-        Reason.MODEL,
-        f"expected actions, the model raised {type(error).__name__} on step {ticket.step}; "
-        "the server goes on, its log says more",
-    )
 
 
 def _cut_off(ticket: Ticket) -> Refusal:
