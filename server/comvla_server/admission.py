@@ -86,6 +86,7 @@ class Admission:
         *,
         overloaded: bool,
         replaces: bool,
+        untried: bool = False,
     ) -> float:
         """Lets a request in, or says why not.
 
@@ -96,6 +97,7 @@ class Admission:
             now_s: monotonic seconds.
             overloaded: robots ask for more than the model can do.
             replaces: it takes the place of an older one of its session.
+            untried: the model computed nothing for a while, though others may use its thread.
 
         Returns:
             Predicted seconds until its answer.
@@ -108,7 +110,8 @@ class Admission:
         mine = ordered.index(place)
         wait_s = times[mine] - now_s
         # A model that rests tries everything: a prediction that was wrong could not be mended else.
-        idle = not waiting and free_s <= now_s
+        rests = free_s <= now_s or (untried and free_s < place.deadline_s)
+        idle = not waiting and rests
         if not self._policy.admission or idle:
             return wait_s
         if (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 from comvla_server.admission import Admission
 from comvla_server.busy import BusyMeter
@@ -20,6 +21,8 @@ from comvla_server.tickets import Place
 _LAG_HALF_LIFE_S = 0.5
 # A halt of the machine says little of the next answer: no more of it is expected again.
 _MOST_LAG_S = 0.25
+# Costs that were too high once are tried again after this, however busy other models keep the thread.
+_UNTRIED_S = 1.0
 # A deadline is in danger where waiting uses up more than this share of its time.
 _DANGER = 0.5
 
@@ -52,7 +55,9 @@ class LoadControl:
         self._metrics = metrics
         self._busy = BusyMeter()
         self._occupancy = occupancy or Occupancy()
-        self._occupancy.join(self, self._offered.load)
+        self._occupancy.join(self, self._offered.load, self._offered.wished_load)
+        self._running = False
+        self._ended_s = 0.0
         self._lag_s = 0.0
         self._lagged_s = 0.0
 
@@ -83,6 +88,7 @@ class LoadControl:
             now_s,
             overloaded=self._occupancy.load(now_s) > 1.0,
             replaces=replaces,
+            untried=not self._running and now_s - self._ended_s >= _UNTRIED_S,
         )
 
     def screen(
@@ -128,6 +134,7 @@ class LoadControl:
 
     def begin(self, work: Work, now_s: float) -> None:
         """A pass starts."""
+        self._running = True
         self._busy.begin(now_s)
         self._occupancy.begin(self, self._costs.predict(work), now_s)
 
@@ -141,6 +148,7 @@ class LoadControl:
             now_s: the time.
             succeeded: whether it says anything about costs.
         """
+        self._running, self._ended_s = False, now_s
         self._busy.end(now_s)
         waited_until_s = self._occupancy.end(self, now_s)
         if succeeded:
@@ -183,8 +191,7 @@ class LoadControl:
 
     def suggested_tokens(self, now_s: float) -> int:
         """Tokens that a request should have at most, 0 for no wish."""
-        whole = self._occupancy.load(now_s)
-        return self._offered.advice(now_s, self.load(now_s) / whole if whole > 0.0 else 1.0)
+        return self._offered.advice(now_s, partial(self._occupancy.share, self, now_s))
 
     def _note_asked(self, place: Place, now_s: float) -> None:
         if place.robot:

@@ -7,6 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+_Load = Callable[[float], float]
+
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
@@ -25,16 +27,17 @@ class Occupancy:
     def __init__(self) -> None:
         self._passes: deque[_Pass] = deque()
         self._started_s = 0.0
-        self._loads: dict[object, Callable[[float], float]] = {}
+        self._loads: dict[object, tuple[_Load, _Load]] = {}
 
-    def join(self, owner: object, load: Callable[[float], float]) -> None:
+    def join(self, owner: object, load: _Load, wished: _Load) -> None:
         """One more model.
 
         Args:
             owner: stands for it.
             load: what is asked of it at a time, as a share of what it could do alone.
+            wished: what would be, if nobody sent fewer tokens for its sake.
         """
-        self._loads[owner] = load
+        self._loads[owner] = load, wished
 
     def leave(self, owner: object) -> None:
         """A model is gone; a pass that it left behind may still run, and is not waited for."""
@@ -79,4 +82,10 @@ class Occupancy:
 
     def load(self, now_s: float) -> float:
         """What is asked of all models, as a share of what the thread can do."""
-        return sum(load(now_s) for load in self._loads.values())
+        return sum(load(now_s) for load, _ in self._loads.values())
+
+    def share(self, owner: object, now_s: float) -> float:
+        """The part of the thread's time that is a model's, by what robots would like to ask of each; 0 to 1."""
+        wished = {each: wish(now_s) for each, (_, wish) in self._loads.items()}
+        whole = sum(wished.values())
+        return wished[owner] / whole if whole > 0.0 and owner in wished else 1.0

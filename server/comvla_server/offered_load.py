@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -24,10 +25,10 @@ class OfferedLoad:
     A request of K tokens costs c(K) = fixed / batch + request + K · token seconds where batches are
     full, so r · c = ρ says how many tokens a request may have on average. Robots whose link carries
     fewer than that leave room to the others: the level L advised is where the mean of min(K, L)
-    meets it. It depends on how often robots ask, not on what they send after they were advised, so
-    it does not swing. It begins when deadlines come into danger, since robots that wait for each
-    answer before they ask again keep a model busy and need no advice, and ends when there is time
-    for what robots would like to send.
+    meets it. It depends on how often robots ask and on what they would like to send, not on what
+    they send after they were advised, so it does not swing. It begins when deadlines come into
+    danger, since robots that wait for each answer before they ask again keep a model busy and need
+    no advice, and ends when there is time for what robots would like to send.
 
     Args:
         costs: what passes cost.
@@ -49,6 +50,9 @@ class OfferedLoad:
         self._sums = (0.0, 0.0, 0.0)
         self._summed_s = self._began_s = -math.inf
         self._wishes: deque[int] = deque(maxlen=_WISHES)
+        self._unbound: deque[int] = deque(
+            maxlen=_WISHES
+        )  # what robots sent while nothing was advised
         self._pressed_s = -math.inf
         self._advice = 0
         self._advised_s = -math.inf
@@ -65,6 +69,8 @@ class OfferedLoad:
             # Whoever sends as much as advised would perhaps send more.
             free = self._advice == 0 or work.tokens < self._advice
             self._wishes.append(work.tokens if free else self._num_tokens)
+            if self._advice == 0:
+                self._unbound.append(work.tokens)
 
     def note_pressure(self, now_s: float) -> None:
         """A deadline came into danger, or could not be kept."""
@@ -89,15 +95,24 @@ class OfferedLoad:
         cost_s = self._costs.request_cost_s(self._max_batch, tokens / requests, pictures / requests)
         return self.requests_per_s(now_s) * cost_s
 
-    def advice(self, now_s: float, share: float = 1.0) -> int:
+    def wished_load(self, now_s: float) -> float:
+        """:meth:`load`, if requests were as large as those of the time before any advice."""
+        requests, _, pictures = self._sums
+        if not self._costs.known or requests <= 0.0 or not self._unbound:
+            return self.load(now_s)
+        tokens = sum(self._unbound) / len(self._unbound)
+        cost_s = self._costs.request_cost_s(self._max_batch, tokens, pictures / requests)
+        return self.requests_per_s(now_s) * cost_s
+
+    def advice(self, now_s: float, share: Callable[[], float] = lambda: 1.0) -> int:
         """Tokens that a request should have at most; 0 where the server has no wish.
 
         Args:
             now_s: the time.
-            share: of the inference thread that is this model's, by what is asked of all that use it.
+            share: tells the part of the inference thread that is this model's.
         """
         if self._active and now_s - self._advised_s >= _RENEW_AFTER_S:
-            self._advice, self._advised_s = self._level(now_s, share), now_s
+            self._advice, self._advised_s = self._level(now_s, share()), now_s
         return self._advice
 
     def _level(self, now_s: float, share: float) -> int:

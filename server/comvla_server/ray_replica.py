@@ -21,6 +21,7 @@ from comvla_server.identity import set_caller
 from comvla_server.lifecycle import Lifecycle, Phase
 from comvla_server.metrics import Metrics
 from comvla_server.model_loading import load_engine
+from comvla_server.process import settle, take_turns
 from comvla_server.refusals import Refusal
 from comvla_server.runtimes import Runtimes
 from comvla_server.secret_files import Watcher
@@ -107,6 +108,7 @@ class Replica:
 
     async def _load(self) -> None:
         settings = self._settings
+        take_turns()
         if self._tokens is not None:
             watcher = Watcher({"tokens": self._tokens}, settings.reload_interval_s, lambda _: None)
             self._watching = asyncio.ensure_future(watcher.run())
@@ -119,6 +121,7 @@ class Replica:
             metrics=self._metrics,
             settings=settings,
         )
+        settle()
         self._lifecycle.enter(Phase.SERVING)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 from comvla_server.cost_model import Work
@@ -16,7 +17,8 @@ class WaitingRoom:
     """Sessions with an observation that waits, a bounded number of them.
 
     One observation per session waits at most. A newer one takes the place of the older one, so that
-    the session keeps its turn.
+    the session keeps its turn. Where all places are taken, a robot with fewer of them than another
+    gets one of that one's: whoever opens many sessions keeps nobody out.
 
     Args:
         size: most sessions that may wait.
@@ -57,7 +59,12 @@ class WaitingRoom:
         Raises:
             Refusal: the room is full, or the answer would be late; or it is another robot's turn.
         """
-        return self._find_place(session_id, work, deadline_s, now_s, self._load.let_in)
+        place, evicted = self._find_place(session_id, work, deadline_s, now_s, self._load.let_in)
+        if evicted is not None:
+            self.take(evicted)
+            self._load.note_unanswered(evicted.place, now_s)
+            evicted.resolve(self._full(now_s, Reason.FAIR_SHARE, "open fewer sessions at once"))
+        return place
 
     def glance(self, deadline_s: float, now_s: float) -> Refusal | None:
         """Whether one more request like those of late could be answered in time; None where it could."""
@@ -105,9 +112,10 @@ class WaitingRoom:
         """Nobody waits any more."""
         self._sessions.clear()
 
-    def _places(self, but: Session | None = None) -> list[Place]:
+    def _places(self, *but: Session | None) -> list[Place]:
         """Places that are taken, in order of arrival."""
-        return [s.queued.place for s in self._sessions.values() if s.queued and s is not but]
+        taken = (s for s in self._sessions.values() if all(s is not other for other in but))
+        return [s.queued.place for s in taken if s.queued]
 
     def _find_place(
         self,
@@ -116,29 +124,44 @@ class WaitingRoom:
         deadline_s: float,
         now_s: float,
         ask: Callable[..., object],
-    ) -> Place:
-        """The place of a new step, where there is one for it."""
-        older = self._sessions.get(session_id)
+    ) -> tuple[Place, Ticket | None]:
+        """The place of a new step, where there is one for it, and whose place it is where none was free."""
+        robot = caller().name or session_id
+        older, evicted = self._sessions.get(session_id), None
         if older is None and len(self) >= self._size:
-            refusal = Refusal(
-                Reason.OVERLOAD,
-                f"the queue is full: {len(self)} of {self._size} sessions wait for the "
-                "model; ask less often, send fewer tokens, or add a replica",
-                retry_after_s=max(0.001, self._load.free_s(now_s) - now_s),
-            )
-            self._load.note_full(now_s)
-            refusal.suggested_tokens = self._load.suggested_tokens(now_s)
-            raise refusal
-        place = Place(caller().name or session_id, work, deadline_s, deadline_s)
+            evicted = self._last_of_many(robot)
+            if evicted is None:
+                self._load.note_full(now_s)
+                raise self._full(now_s, Reason.OVERLOAD, "ask less often, send fewer tokens")
+        place = Place(robot, work, deadline_s, deadline_s)
         if older is not None and older.queued is not None:
             # The newer observation may wait longer, but it is the robot's turn when it was before.
             place.due_s = min(deadline_s, older.queued.place.due_s)
+        leaving = None if evicted is None else self._sessions[evicted.session_id]
         try:
-            ask(place, self._places(but=older), now_s, replaces=older is not None)
+            ask(place, self._places(older, leaving), now_s, replaces=older is not None)
         except Refusal as refusal:
             refusal.suggested_tokens = self._load.suggested_tokens(now_s)
             raise
-        return place
+        return place, evicted
+
+    def _last_of_many(self, robot: str) -> Ticket | None:
+        """The observation, of whom most wait, that would be computed last; None where none has more than this robot."""
+        counts = Counter(place.robot for place in self._places())
+        most, count = counts.most_common(1)[0]
+        if count < counts[robot] + 2:  # else the next one would only take it back
+            return None
+        return next(t for t in reversed(self.in_turn()) if t.place.robot == most)
+
+    def _full(self, now_s: float, reason: Reason, remedy: str) -> Refusal:
+        refusal = Refusal(
+            reason,
+            f"the queue is full: {len(self)} of {self._size} sessions wait for the model; "
+            f"{remedy}, or add a replica",
+            retry_after_s=max(0.001, self._load.free_s(now_s) - now_s),
+        )
+        refusal.suggested_tokens = self._load.suggested_tokens(now_s)
+        return refusal
 
 
 def too_late(ticket: Ticket) -> Refusal:

@@ -11,6 +11,8 @@ from comvla_server.load_control import LoadControl
 from comvla_server.load_policy import LoadPolicy
 from comvla_server.metrics import Metrics
 from comvla_server.occupancy import Occupancy
+from comvla_server.refusals import Refusal
+from comvla_server.tickets import Place
 
 WORK = Work(1, 10)
 
@@ -50,11 +52,38 @@ def test_waiting_for_another_model_is_no_cost_of_ones_own() -> None:
 
 def test_what_is_asked_of_all_models_counts() -> None:
     occupancy = Occupancy()
-    occupancy.join("a", lambda now_s: 0.7)
-    occupancy.join("b", lambda now_s: 0.1 * now_s)
+    occupancy.join("a", lambda now_s: 0.7, lambda now_s: 0.9)
+    occupancy.join("b", lambda now_s: 0.1 * now_s, lambda now_s: 2.7)
     assert occupancy.load(4.0) == pytest.approx(1.1)
+    assert occupancy.share("a", 4.0) == pytest.approx(0.25)
+    assert occupancy.share("new", 4.0) == 1.0
     occupancy.leave("a")
     assert occupancy.load(4.0) == pytest.approx(0.4)
+    assert occupancy.share("b", 4.0) == 1.0
+
+
+def test_a_model_with_a_wrong_estimate_is_tried_again_though_another_keeps_the_thread_busy() -> (
+    None
+):
+    occupancy = Occupancy()
+    wrong = CostModel()
+    wrong.observe(WORK, 0.5)  # a stall; it takes 0.05 s
+    model = LoadControl(8, 512, LoadPolicy(), wrong, Metrics(), occupancy)
+    let_in_s = []
+    for tick in range(200):
+        now_s = 10.0 + 0.05 * tick
+        occupancy.begin("other", 0.05, now_s)
+        try:
+            model.let_in(Place("arm", WORK, now_s + 0.4, now_s + 0.4), [], now_s, replaces=False)
+        except Refusal:
+            occupancy.end("other", now_s + 0.05)
+            continue
+        let_in_s.append(now_s)
+        model.begin(WORK, now_s)
+        occupancy.end("other", now_s + 0.05)
+        model.end(WORK, now_s, now_s + 0.1, succeeded=True)
+    assert wrong.predict(WORK) < 0.15
+    assert len(let_in_s) > 50
 
 
 def test_a_model_that_is_gone_is_not_waited_for() -> None:

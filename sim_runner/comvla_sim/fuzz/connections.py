@@ -28,6 +28,7 @@ _KNOWN = UnicodeDecodeError.__name__
 _BATCH = 24
 _PATIENCE_S = 20.0
 _COME_AGAIN_S = 0.1
+_BYSTANDERS = itertools.count()
 # A connection whose frames no longer fit together waits for bytes that never come; so long is waited
 # for a last word of the server.
 _LAST_WORD_S = 0.03
@@ -91,7 +92,8 @@ async def _search(batch: Sequence[Case], server: SupervisedServer, tally: Tally,
 
 async def _unwell(target: str) -> str:
     """What is wrong with the answer to somebody else's valid request; empty where nothing is."""
-    request = valid_request("bystander", 0, payload(8, "float32"))
+    # Somebody new each time: a repeat would be answered from the record, whatever became of the model.
+    request = valid_request(f"bystander-{next(_BYSTANDERS)}", 0, payload(8, "float32"))
     until_s = time.monotonic() + _PATIENCE_S
     async with grpc.aio.insecure_channel(target, options=list(codec.GRPC_OPTIONS)) as channel:
         stub = policy_pb2_grpc.PolicyServiceStub(channel)
