@@ -24,7 +24,7 @@ from comvla_client.sending import SendingPolicy
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading
 from comvla_client.tracing import Tracing, traced
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 from comvla_client.uplink import UplinkForm
 
 

@@ -1,4 +1,4 @@
-"""How a request reaches the server: the protocol that clients use, and gRPC as its default form."""
+"""How a request reaches the server: over gRPC, the default form of the protocol that clients use."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import grpc
 
@@ -19,6 +19,7 @@ from comvla_client.access import Access, Metadata, TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.revival import Revival, discard
 from comvla_client.streaming import PayloadStream, paced
+from comvla_client.transport_protocol import ProgressiveTransport, Transport
 from comvla_client.warm_up import WarmUp
 
 __all__ = ["GrpcTransport", "ProgressiveTransport", "Transport", "TransportError"]
@@ -28,42 +29,6 @@ Start = Callable[[Any, float, Metadata], Any]
 
 _FILLER_TIMEOUT_S = 1.0
 _CLOSE_WITHIN_S = 0.2
-
-
-class Transport(Protocol):
-    """Carries calls to a policy server. Wrap one to emulate a link, record, or inject faults."""
-
-    def get_model(self, timeout_s: float) -> GetModelResponse:
-        """The server's description of its model.
-
-        Raises:
-            TransportError: no usable answer within ``timeout_s`` seconds.
-        """
-        ...
-
-    def infer(self, request: InferRequest, timeout_s: float) -> InferResponse:
-        """Actions for one observation.
-
-        Raises:
-            TransportError: no usable answer within ``timeout_s`` seconds.
-        """
-        ...
-
-    def close(self) -> None:
-        """Ends calls under way and frees the connection. May be called from another thread."""
-        ...
-
-
-class ProgressiveTransport(Transport, Protocol):
-    """A transport that also takes payloads in pieces, for policies that send so."""
-
-    def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
-        """Actions for as much of one observation as arrives within the stream's window.
-
-        Raises:
-            TransportError: no usable answer within ``timeout_s`` seconds.
-        """
-        ...
 
 
 class GrpcTransport:

@@ -24,7 +24,7 @@ Start = Callable[[Any, float, Metadata], Any]
 
 
 class AsyncTransport(Protocol):
-    """:class:`comvla_client.transport.Transport` with awaitable calls."""
+    """:class:`comvla_client.transport_protocol.Transport` with awaitable calls."""
 
     async def get_model(self, timeout_s: float) -> GetModelResponse:
         """The server's description of its model, or TransportError."""
@@ -40,7 +40,7 @@ class AsyncTransport(Protocol):
 
 
 class AsyncProgressiveTransport(AsyncTransport, Protocol):
-    """:class:`comvla_client.transport.ProgressiveTransport` with awaitable calls."""
+    """:class:`comvla_client.transport_protocol.ProgressiveTransport` with awaitable calls."""
 
     async def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
         """Actions for as much of one observation as arrives in time, or TransportError."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from comvla_client.diagnosis.finding import Allowance, Finding, out_of_time
 from comvla_client.diagnosis.probes import upload_request, upload_s, wire_bytes
 from comvla_client.errors import TransportError
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 
 SMALLEST_BYTES, LARGEST_BYTES = 4 << 10, 4 << 20
 REPEATS = 3

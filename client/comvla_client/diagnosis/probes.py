@@ -12,7 +12,7 @@ from comvla import codec
 from comvla.model_info import PROTOCOL_VERSION, ModelInfo
 from comvla.v1.policy_pb2 import InferRequest, InferResponse
 from comvla_client.errors import TransportError
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 
 SESSION = "comvla-doctor"
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from comvla.model_info import ModelInfo
 from comvla_client.diagnosis.finding import Allowance, Finding
 from comvla_client.errors import TransportError
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from comvla_client.diagnosis.probes import query, query_request
 from comvla_client.errors import TransportError
 from comvla_client.health import check_health
 from comvla_client.locked_out import locked_out
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 
 QUERIES = 3
 BUSY = 0.9

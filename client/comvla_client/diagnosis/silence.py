@@ -15,7 +15,7 @@ from comvla_client.diagnosis.finding import Allowance, Finding, out_of_time
 from comvla_client.diagnosis.goodput import Goodput
 from comvla_client.diagnosis.probes import upload_request, upload_s
 from comvla_client.errors import TransportError
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 
 SILENCE_S = 1.2
 """Longer than TCP's retransmission timeout, after which it forgets a connection's speed."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from comvla_client import StepReport
 from comvla_client.sending import SendingPolicy
 from comvla_client.snr import SnrReading
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 from comvla_sim.experiments.link_case import LEAD_IN, LinkCase
 from comvla_sim.link import EnforcedLink, LinkRecord
 

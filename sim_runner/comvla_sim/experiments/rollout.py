@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from comvla_client import ComVLAClient, StepReport
 from comvla_client.edge import EdgeModel
-from comvla_client.transport import GrpcTransport, Transport
+from comvla_client.transport import GrpcTransport
+from comvla_client.transport_protocol import Transport
 from comvla_client.uplink import UplinkForm
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout, foreign_layout

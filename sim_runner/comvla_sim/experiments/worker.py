@@ -12,7 +12,7 @@ from comvla_sim.experiments.policy import load_edge_half, load_policy
 
 if TYPE_CHECKING:
     from comvla_client.edge import EdgeModel
-    from comvla_client.transport import Transport
+    from comvla_client.transport_protocol import Transport
     from comvla_sim.experiments.rollout import OnQuery
     from comvla_sim.worlds.base import World
     from comvla_vla import CloudModel
