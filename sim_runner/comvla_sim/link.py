@@ -13,23 +13,20 @@ from typing import Literal
 
 from comvla import codec
 from comvla.errors import LinkError
-from comvla.v1.policy_pb2 import GetModelResponse, ImageCoding, InferRequest, InferResponse
+from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
 from comvla_client import LinkProfile, SnrReading
 from comvla_client.errors import TransportError
 from comvla_client.streaming import PayloadStream, periods_of
-from comvla_client.transport import Transport
+from comvla_client.transport_protocol import Transport
 from comvla_sim.link_records import LinkRecord, PeriodRecord
 from comvla_sim.radio import Radio
+from comvla_sim.radio_costs import COUNTS, RadioCosts, whole_tokens
 
 __all__ = ["COUNTS", "MODES", "UNENFORCED", "EnforcedLink", "LinkRecord", "PeriodRecord"]
 
 MODES = ("prefix", "drop", "queue")
 UNENFORCED = "none"
 """The mode of a link that withholds nothing."""
-
-COUNTS = ("framed", "encoded")
-
-_ANALOGUE = (ImageCoding.IMAGE_CODING_DEEP_JSCC, ImageCoding.IMAGE_CODING_WITT)
 
 
 class EnforcedLink:
@@ -93,8 +90,7 @@ class EnforcedLink:
     ) -> None:
         if mode not in (*MODES, UNENFORCED):
             raise LinkError(f"mode must be one of {', '.join((*MODES, UNENFORCED))}, got {mode!r}")
-        if count not in COUNTS:
-            raise LinkError(f"count must be one of {', '.join(COUNTS)}, got {count!r}")
+        self._costs = RadioCosts(link, count)
         if patience_periods < 1 or buffer_bytes < 0:
             raise LinkError(
                 "expected patience_periods of at least 1 and buffer_bytes of at least 0, got "
@@ -103,7 +99,6 @@ class EnforcedLink:
         self._transport = transport
         self._link = link
         self._mode = mode
-        self._count = count
         self._patience_periods = patience_periods
         # Unless it queues, a modem forgets what did not cross when it should have.
         self._radio = Radio(channel, link, buffer_bytes if mode == "queue" else 0)
@@ -198,7 +193,7 @@ class EnforcedLink:
         if request.HasField("images"):
             return self._infer_pictures(request, timeout_s, window_s)
         length = len(request.payload)
-        offered_bytes = self._cost_bytes(request, length)
+        offered_bytes = self._costs.request_bytes(request, length)
         header = codec.read_header(request.payload)
         periods = self._patience_periods if self._mode == "queue" else self._span(window_s)
         asked = _Asked(self)
@@ -207,8 +202,8 @@ class EnforcedLink:
         if carried_bytes == offered_bytes:
             kept_bytes = length
         elif self._mode == "prefix":
-            kept_bytes = self._fitting_payload_bytes(request, carried_bytes)
-        tokens = _whole_tokens(header, kept_bytes)
+            kept_bytes = self._costs.fitting_payload_bytes(request, carried_bytes)
+        tokens = whole_tokens(header, kept_bytes)
         self._radio.give_up()
         self._note(asked, offered_bytes, carried_bytes, header.count, tokens)
         if not tokens:
@@ -224,7 +219,7 @@ class EnforcedLink:
         self, request: InferRequest, timeout_s: float, window_s: float
     ) -> InferResponse:
         """Carries pictures whole or not at all: half a file shows nothing."""
-        offered_bytes = self._pictures_cost_bytes(request)
+        offered_bytes = self._costs.pictures_bytes(request, self.capacity_bits)
         periods = self._patience_periods if self._mode == "queue" else self._span(window_s)
         asked = _Asked(self)
         carried_bytes = self._carry(offered_bytes, periods)
@@ -234,23 +229,6 @@ class EnforcedLink:
             raise self._lost(asked, offered_bytes, carried_bytes, "no picture is of use in part")
         return self._transport.infer(request, timeout_s)
 
-    def _pictures_cost_bytes(self, request: InferRequest) -> int:
-        """Bytes on the radio for pictures. An analogue symbol is one use of the channel, W·T of which make a period: it
-        is charged as the bytes that would take as long at the SNR of the period, everything else as it is.
-        """
-        images = request.images
-        cost = images.ByteSize()
-        if self._count == "framed":
-            cost = codec.wire_bytes(request.ByteSize()) + codec.CALL_HEADERS_BYTES
-        if images.coding not in _ANALOGUE:
-            return cost
-        from comvla_vla.codecs.waveform import channel_uses
-
-        uses = sum(channel_uses(view.data) for view in images.views)
-        share = uses / (self._link.bandwidth_hz * self._link.period_s)
-        digital = cost - sum(len(view.data) for view in images.views)
-        return digital + int(share * self.capacity_bits / 8)
-
     def infer_progressive(self, stream: PayloadStream, timeout_s: float) -> InferResponse:
         """Carries a payload piece by piece until its window ends, and the answer back.
 
@@ -258,15 +236,15 @@ class EnforcedLink:
             TransportError: ``DEADLINE_EXCEEDED`` when fewer tokens arrived than the robot asks for,
                 and whatever the wrapped transport raises.
         """
-        costs = self._piece_costs(stream)
+        costs = self._costs.piece_bytes(stream)
         header = codec.read_header(stream.payload)
         asked = _Asked(self)
         carried_bytes = self._carry(costs[-1], self._span(stream.window_s))
         kept_bytes = self._radio.give_up()
-        whole = [*costs[:-1], costs[-1] - codec.HTTP2_END_BYTES * (self._count == "framed")]
+        whole = [*costs[:-1], costs[-1] - self._costs.end_bytes]
         arrived = bisect.bisect_right(whole, carried_bytes)
         stream.taken = min(len(costs), bisect.bisect_right(costs, carried_bytes + kept_bytes) + 1)
-        tokens = _whole_tokens(header, stream.ends[arrived - 1] if arrived else 0)
+        tokens = whole_tokens(header, stream.ends[arrived - 1] if arrived else 0)
         self._note(asked, costs[-1], carried_bytes, header.count, tokens, progressive=True)
         least = max(1, stream.min_tokens)
         if tokens < least:
@@ -324,39 +302,6 @@ class EnforcedLink:
             f"({asked.snr_db:.1f} dB), {found}: send fewer tokens",
         )
 
-    def _fitting_payload_bytes(self, request: InferRequest, room_bytes: int) -> int:
-        """Length of the longest prefix of the payload that fits; 0 where not even the rest does."""
-        fitting = bisect.bisect_right(
-            range(len(request.payload)),
-            room_bytes,
-            key=lambda kept: self._cost_bytes(request, kept),
-        )
-        return max(0, fitting - 1)
-
-    def _piece_costs(self, stream: PayloadStream) -> list[int]:
-        """Bytes on the radio up to the end of each piece."""
-        if self._count == "encoded":
-            return list(stream.ends)
-        return [codec.CALL_HEADERS_BYTES + cost for cost in stream.costs()]
-
-    def _cost_bytes(self, request: InferRequest, payload_length: int) -> int:
-        """Bytes on the radio for this request with that much of its payload."""
-        if self._count == "encoded":
-            return payload_length
-        message = codec.infer_request_bytes(
-            payload_length,
-            session_id=request.session_id,
-            step=request.step,
-            instruction=request.instruction,
-            proprio_dim=len(request.proprio),
-            model_fingerprint=request.model_fingerprint,
-            snr=request.HasField("snr_db"),
-            snr_age=request.HasField("snr_age_s"),
-            protocol_version=request.protocol_version,
-            model=request.model,
-        )
-        return codec.wire_bytes(message) + codec.CALL_HEADERS_BYTES
-
 
 class _Asked:
     """The link as a request found it."""
@@ -368,10 +313,3 @@ class _Asked:
         self.capacity_bits = current.capacity_bits
         self.available_bits = current.capacity_bits - 8 * current.delivered_bytes
         self.backlog_bytes = link.backlog_bytes
-
-
-def _whole_tokens(header: codec.PayloadHeader, length: int) -> int:
-    arrived = codec.prefix_tokens(
-        length, header.token_dim, header.quantization, num_towers=len(header.tower_dims)
-    )
-    return min(header.count, arrived)
