@@ -7,7 +7,6 @@ import contextlib
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager
-from functools import partial
 from typing import Any
 
 import grpc
@@ -15,7 +14,8 @@ import grpc
 from comvla import codec, handshake
 from comvla.v1 import policy_pb2, policy_pb2_grpc
 from comvla_server.accounts import Answered, CallAccounts
-from comvla_server.calls import CallRecord, this_call
+from comvla_server.answering import Answering
+from comvla_server.calls import CallRecord
 from comvla_server.fleet import Fleet
 from comvla_server.lifecycle import Lifecycle
 from comvla_server.memory import BytesInFlight, Lease
@@ -26,12 +26,10 @@ from comvla_server.refusals import Reason, Refusal
 from comvla_server.screening import Screening
 from comvla_server.settings import ServerSettings
 from comvla_server.statuses import STATUS, hints
-from comvla_server.tickets import Answer
-from comvla_server.tracing import Tracing, current_trace
-from comvla_server.traffic import Traffic, announced_tokens, decoded_bytes
+from comvla_server.tracing import Tracing
+from comvla_server.traffic import Traffic
 from comvla_server.validation import content_digest
 from comvla_server.version import server_version
-from comvla_vla.request import AnyRequest
 
 
 class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
@@ -70,6 +68,7 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
         self.screening = Screening(self.models, settings.admission, clock)
         self.fleet = fleet or Fleet()
         self._accounts = CallAccounts(metrics, self.fleet, settings.default_deadline_s, clock)
+        self._answering = Answering(metrics, clock)
         self._in_flight = BytesInFlight(settings.max_bytes_in_flight)
         metrics.watch_bytes(lambda: self._in_flight.held)
 
@@ -143,7 +142,9 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
                 lease.take(request.ByteSize())
                 runtime = self._find(request.model)
                 with self._using(runtime):
-                    return await self._answer(runtime, request, lease, started_s, deadline_s)
+                    return await self._answering.answer(
+                        runtime, request, lease, started_s, deadline_s
+                    )
 
         answer = self._accounts.run(request, time_remaining_s, work)
         return await self.screening.watched(answer, request, time_remaining_s)
@@ -244,101 +245,6 @@ class PolicyService(policy_pb2_grpc.PolicyServiceServicer):
             finally:
                 self._traffic.count_payload(reader.payload)
                 self._metrics.streams.labels(reader.ending).inc()
-            return await self._answer(runtime, request, lease, started_s, deadline_s, digest)
-
-    async def _answer(
-        self,
-        runtime: Runtime,
-        request: policy_pb2.InferRequest,
-        lease: Lease,
-        started_s: float,
-        deadline_s: float,
-        digest: bytes | None = None,
-    ) -> Answered:
-        if deadline_s <= started_s:
-            raise Refusal(
-                Reason.DEADLINE,
-                "the deadline had passed when the request arrived: expected time to compute, none "
-                "was left; allow more time or send fewer tokens",
+            return await self._answering.answer(
+                runtime, request, lease, started_s, deadline_s, digest
             )
-        runtime.validator.check_identity(request)
-        batcher = runtime.batcher
-        pictures = request.HasField("images")
-        most = runtime.engine.info.num_tokens
-        tokens = most if pictures else min(most, announced_tokens(request.payload))
-        if tokens:  # else it is no observation, and will be told so
-            batcher.screen(request.session_id, request.step, tokens, deadline_s, pictures=pictures)
-        if digest is None:
-            digest = content_digest(request)
-        ticket = batcher.find(request.session_id, request.step, digest)
-        decode_began_s, decode_s = self._clock(), 0.0
-        policy_request: AnyRequest | None = None
-        if ticket is None:
-            lease.take(decoded_bytes(request))
-            policy_request = await self._read(runtime, request, deadline_s)
-            this_call().note_read(policy_request, runtime.engine.info)
-            decode_s = self._clock() - decode_began_s
-            self._metrics.step_phase.labels("decode").observe(decode_s)
-            # While pictures were decoded, a repeat of this step or a newer one may have come.
-            ticket = batcher.find(request.session_id, request.step, digest)
-        repeat = ticket is not None
-        on_record = ticket is not None and ticket.outcome.done()
-        if ticket is None:
-            assert policy_request is not None
-            if request.HasField("snr_db"):
-                self._metrics.reported_snr_db.observe(request.snr_db)
-            ticket = batcher.admit(
-                request.session_id, request.step, policy_request, digest, deadline_s
-            )
-        answer = await batcher.wait(ticket, deadline_s)
-        finished_s = self._clock()
-        self._metrics.model_requests.labels(runtime.label, "repeat" if repeat else "ok").inc()
-        response = self._response(request, runtime, answer)
-        response.timings.decode_s = decode_s
-        if not on_record:  # phases of this call, so that they never exceed its total
-            response.timings.queue_s = answer.queue_s
-            response.timings.predict_s = answer.predict_s
-        response.timings.total_s = self._clock() - started_s
-        if (trace := current_trace()) is not None:
-            trace.answered(
-                request,
-                answer,
-                model=runtime.label,
-                decoded_s=(decode_began_s, decode_began_s + decode_s),
-                admitted_s=ticket.admitted_s,
-                finished_s=finished_s,
-                encoded_s=self._clock(),
-                repeat=repeat,
-            )
-        return response, repeat
-
-    async def _read(
-        self, runtime: Runtime, request: policy_pb2.InferRequest, deadline_s: float
-    ) -> AnyRequest:
-        """Tokens here and now, which takes microseconds; pictures in their own thread."""
-        read = partial(runtime.validator.read, request)
-        if request.HasField("images"):
-            return await runtime.decoding.run(read, deadline_s)
-        return read()
-
-    def _response(
-        self, request: policy_pb2.InferRequest, runtime: Runtime, answer: Answer
-    ) -> policy_pb2.InferResponse:
-        horizon, action_dim = answer.actions.shape
-        return policy_pb2.InferResponse(
-            session_id=request.session_id,
-            step=request.step,
-            actions=answer.actions.ravel().tolist(),
-            action_horizon=horizon,
-            action_dim=action_dim,
-            tokens_used=answer.tokens_used,
-            batch_size=answer.batch_size,
-            cloud_flops=answer.cloud_flops,
-            load=policy_pb2.LoadHint(
-                queue_depth=runtime.batcher.queue_depth,
-                utilization=runtime.batcher.utilization,
-                suggested_tokens=runtime.batcher.suggested_tokens,
-            ),
-            # Checked: the model's own, or that of one with the same edge half.
-            model_fingerprint=request.model_fingerprint,
-        )
