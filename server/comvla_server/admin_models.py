@@ -60,7 +60,7 @@ class SwapOrder(BaseModel):
 
 
 class SwapDone(BaseModel):
-    """See :class:`comvla_server.swapping.SwapReport`."""
+    """See :class:`comvla_server.swap_report.SwapReport`."""
 
     model: str
     source: str

@@ -12,7 +12,7 @@ import logging
 import time
 import weakref
 from collections.abc import Awaitable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, TypeAlias, TypeVar
 
 from comvla import handshake
@@ -26,9 +26,12 @@ from comvla_server.models import Models, Runtime
 from comvla_server.refusals import Refusal
 from comvla_server.runtimes import Runtimes
 from comvla_server.settings import ServerSettings
+from comvla_server.swap_report import SwapReport, compare
 from comvla_server.version import server_version
 from comvla_server.vision import VisionHalf
 from comvla_server.wording import shown
+
+__all__ = ["SwapError", "SwapReport", "Swapper", "Trouble"]
 
 _log = logging.getLogger(__name__)
 
@@ -48,40 +51,6 @@ class SwapError(ComVLAError):
     def __init__(self, trouble: Trouble, message: str) -> None:
         super().__init__(message)
         self.trouble: Trouble = trouble
-
-
-@dataclass(frozen=True)
-class SwapReport:
-    """What was replaced by what.
-
-    Attributes:
-        model: name under which robots ask for it; empty for one without a name.
-        source: the new checkpoint.
-        before: fingerprint of the old model.
-        after: fingerprint of the new one.
-        robots: what it means for them: ``same`` model, ``compatible`` (another cloud half for the
-            same edge half), or ``new_edge`` (they have to load another edge half).
-        needed_bytes: memory for the new model, beside the old one.
-        available_bytes: memory there was; None where nobody tells.
-        swapped: False where it was only checked.
-        load_s: seconds that loading took, while the old model answered.
-        warm_up_s: seconds of the first forward passes, likewise.
-        drain_s: seconds until the old model had answered the last call that it had taken.
-        freed: whether the old model's memory was given back by then; else that follows.
-    """
-
-    model: str
-    source: str
-    before: str
-    after: str
-    robots: Literal["same", "compatible", "new_edge"]
-    needed_bytes: int
-    available_bytes: int | None
-    swapped: bool = False
-    load_s: float = 0.0
-    warm_up_s: float = 0.0
-    drain_s: float = 0.0
-    freed: bool = False
 
 
 class Swapper:
@@ -195,7 +164,7 @@ class Swapper:
         self, thread: InferenceThread, old: Runtime, source: str, new_edge: bool, check: bool
     ) -> SwapReport:
         candidate = await _trying(thread.run(self._loader.inspect, source), source)
-        report = self._compare(old, candidate)
+        report = compare(old, candidate)
         if check:
             return report
         if report.robots == "new_edge" and not new_edge:
@@ -243,25 +212,6 @@ class Swapper:
             extra={"before": done.before, "after": done.after},
         )
         return done
-
-    def _compare(self, old: Runtime, candidate: Candidate) -> SwapReport:
-        before, after = old.engine.info, candidate.info
-        robots: Literal["same", "compatible", "new_edge"] = "new_edge"
-        if handshake.mismatch(before, after) is None:
-            robots = "same"
-        elif handshake.mismatch(before, replace(after, fingerprint=before.fingerprint)) is None:
-            identity = old.engine.edge_identity
-            if identity is not None and identity == candidate.edge_identity:
-                robots = "compatible"
-        return SwapReport(
-            model=old.name,
-            source=candidate.source,
-            before=before.fingerprint,
-            after=after.fingerprint,
-            robots=robots,
-            needed_bytes=candidate.needed_bytes,
-            available_bytes=candidate.available_bytes,
-        )
 
     def _load(self, source: str, old: Engine) -> Engine:
         engine = self._loader.load(source)
