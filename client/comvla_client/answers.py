@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +18,7 @@ from comvla.errors import (
 from comvla.model_info import ModelInfo
 from comvla.v1.policy_pb2 import InferRequest, InferResponse
 from comvla_client.errors import TransportError
-from comvla_client.report import FallbackReason
+from comvla_client.report import FallbackReason, Load, StepReport
 
 # A link or a server that may be better at the next step.
 _FALLBACKS: dict[str, FallbackReason] = {
@@ -108,3 +110,31 @@ def read_actions(
     if not np.isfinite(actions).all():
         raise TransportError("DATA_LOSS", "the answer holds actions that are not finite")
     return actions
+
+
+def answered(report: StepReport, response: InferResponse) -> StepReport:
+    """The report of a step with what the server says of its answer.
+
+    Args:
+        report: of the step, closed.
+        response: the answer to it.
+    """
+    timings, load = response.timings, response.load
+    return replace(
+        report,
+        source="cloud",
+        tokens_used=response.tokens_used,
+        server_timings_s={
+            "decode": timings.decode_s,
+            "queue": timings.queue_s,
+            "predict": timings.predict_s,
+            "total": timings.total_s,
+        },
+        batch_size=response.batch_size,
+        cloud_flops=response.cloud_flops,
+        load=Load(
+            queue_depth=load.queue_depth,
+            utilization=load.utilization,
+            suggested_tokens=load.suggested_tokens,
+        ),
+    )

@@ -7,41 +7,37 @@ missing answer into the rest of the last chunk. Nothing here waits, calls or kno
 from __future__ import annotations
 
 import math
-import re
-import secrets
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from comvla import codec, handshake
-from comvla.errors import HandshakeError, ModelChangedError
-from comvla.model_info import PROTOCOL_VERSION, ModelInfo
-from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
+from comvla.errors import HandshakeError
+from comvla.model_info import ModelInfo
+from comvla.v1.policy_pb2 import GetModelResponse, InferResponse
 from comvla_client.advice import BackOff, TokenAdvice
-from comvla_client.agreement import check_model
-from comvla_client.answers import fallback_reason, read_actions
+from comvla_client.agreement import check_model, check_successor
+from comvla_client.answers import answered, fallback_reason, read_actions
 from comvla_client.budget import PAPER_LINK, LinkProfile
 from comvla_client.edge import EdgeModel
 from comvla_client.errors import TransportError
 from comvla_client.observation import Observation, check_instruction, check_observation
+from comvla_client.parts import check_parts, check_transport
 from comvla_client.planning import Planner
 from comvla_client.prepared import Prepared
 from comvla_client.queue import ActionQueue, Actions
 from comvla_client.registry import make_uplink
-from comvla_client.report import PHASES, ActionChunk, Load, StepReport
+from comvla_client.report import PHASES, ActionChunk, StepReport
 from comvla_client.selection import Selector
-from comvla_client.sending import Floor, SendingPolicy, make_policy
+from comvla_client.sending import SendingPolicy, make_policy
+from comvla_client.session import Session
 from comvla_client.sizing import Budget
 from comvla_client.snr import SnrInput, SnrReading, as_reading, as_source
 from comvla_client.uplink import Setup, UplinkForm
 
 WIND_UP_S = 0.002
 """What is kept of a deadline for giving up a call and writing the report, in seconds."""
-
-_SESSION_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@/+=-]{0,99}")
 
 
 class ClientCore:
@@ -70,34 +66,16 @@ class ClientCore:
     ) -> None:
         self._form = make_uplink(uplink, selector)
         self.sending = make_policy(sending)
-        if self.sending.progressive and not self._form.in_pieces:
-            raise ValueError(
-                f"sending={self.sending.name!r} sends tokens piece by piece, {self._form.name} sends "
-                "pictures, which arrive whole or not at all: choose sending='paper' or 'margin'"
-            )
-        if isinstance(self.sending, Floor) and not self._form.in_pieces:
-            raise ValueError(
-                f"sending={self.sending.name!r} has a floor in tokens, {self._form.name} sends pictures: "
-                "choose sending='paper' or 'margin'"
-            )
         self._takes_any = edge is None
         self._edge = None if edge is None or isinstance(edge, ModelInfo) else edge
-        if self._form.needs_edge and self._edge is None:
-            raise ValueError(
-                f"{self._form.name} sends tokens, which takes the robot's half of the model: pass "
-                "edge=load_edge(...), or let the cloud see with uplink='jpeg-75'"
-            )
+        check_parts(self._form, self.sending, self._edge)
         self._options = link, quantization, budget, min_tokens
         self._execute, self._hold, self._deadline_s = execute, hold, deadline_s
         self._info: ModelInfo | None = None
         if edge is not None:
             self._begin(edge if isinstance(edge, ModelInfo) else edge.info)
         self._snr = None if snr is None else as_source(snr)
-        self._seed = seed
-        self._model = model
-        self._session = _session_name(session_id)
-        self._episode = 0
-        self._step = 0
+        self._session = Session(session_id, seed, model)
 
     @property
     def info(self) -> ModelInfo:
@@ -115,12 +93,11 @@ class ClientCore:
     @property
     def session(self) -> str:
         """Identity of the current episode on the wire."""
-        return f"{self._session}.{self._episode}"
+        return self._session.name
 
     def reset(self) -> None:
         """Begins a new episode: a new session, step 0, nothing left to execute."""
-        self._episode += 1
-        self._step = 0
+        self._session.reset()
         self.queue.clear()
         self.sending.reset()
         self._form.reset()
@@ -158,12 +135,7 @@ class ClientCore:
             ModelChangedError: the robot would have to move otherwise than before.
         """
         before, after = self.info, handshake.from_response(response)
-        for name in ("action_dim", "delta_actions", "control_period_s"):
-            if getattr(before, name) != getattr(after, name):
-                raise ModelChangedError(
-                    f"the server has another model now, {after.name}, whose {name} is "
-                    f"{getattr(after, name)}, expected {getattr(before, name)}: make a new client"
-                )
+        check_successor(after, before)
         queue = self.queue
         self._info = None
         self.accept_server(response)
@@ -186,14 +158,13 @@ class ClientCore:
         checked = check_observation(obs, self.info, any_size=self._any_image_size)
         self._form.hear(check_instruction(instruction))
         reading = self._read_snr(snr)
-        request = self._blank_request(instruction, checked.proprio.tolist(), reading)
+        request = self._session.request(self.info, instruction, checked.proprio.tolist(), reading)
         plan = self._planner.plan(reading, request)
         report = self._planner.opened(reading, request, plan)
         plan = self._planner.as_advised(plan)
         planned = time.perf_counter()
         deadline = started + self.deadline_s - min(WIND_UP_S, 0.1 * self.deadline_s)
-        rng = np.random.default_rng([self._seed, self._episode, self._step])
-        self._step += 1
+        rng = self._session.next_step()
         pause_s = self._back_off.remaining_s
         if plan.count and pause_s > 0.0:
             words = f"the server is busy: asking again in {pause_s:.3f} s at the earliest"
@@ -243,11 +214,7 @@ class ClientCore:
         Raises:
             ValueError: the policy sends pieces, and it takes none.
         """
-        if self.sending.progressive and not hasattr(transport, "infer_progressive"):
-            raise ValueError(
-                f"sending={self.sending.name!r} needs a transport with infer_progressive(stream, "
-                f"timeout_s), {type(transport).__name__} has none: add it, or choose another policy"
-            )
+        check_transport(self.sending, transport)
 
     def complete(self, prepared: Prepared, response: InferResponse, call_s: float) -> ActionChunk:
         """The chunk of an answer.
@@ -269,25 +236,7 @@ class ClientCore:
         self._form.settle(prepared.request.step, True)
         self._back_off.answered()
         self._planner.advice.hear(response.load.suggested_tokens)
-        timings = response.timings
-        report = replace(
-            self._closed(prepared, call_s, response.tokens_used),
-            source="cloud",
-            tokens_used=response.tokens_used,
-            server_timings_s={
-                "decode": timings.decode_s,
-                "queue": timings.queue_s,
-                "predict": timings.predict_s,
-                "total": timings.total_s,
-            },
-            batch_size=response.batch_size,
-            cloud_flops=response.cloud_flops,
-            load=Load(
-                queue_depth=response.load.queue_depth,
-                utilization=response.load.utilization,
-                suggested_tokens=response.load.suggested_tokens,
-            ),
-        )
+        report = answered(self._closed(prepared, call_s, response.tokens_used), response)
         self._tell_source(report)
         return ActionChunk(actions=actions, planned=len(actions), report=report)
 
@@ -373,36 +322,8 @@ class ClientCore:
         if observe is not None:
             observe(report)
 
-    def _blank_request(
-        self, instruction: str, proprio: list[float], reading: SnrReading | None
-    ) -> InferRequest:
-        request = InferRequest(
-            session_id=self.session,
-            step=self._step,
-            instruction=instruction,
-            proprio=proprio,
-            model_fingerprint=self.info.fingerprint,
-            protocol_version=PROTOCOL_VERSION,
-            model=self._model,
-        )
-        if reading is not None and math.isfinite(reading.snr_db):
-            request.snr_db, request.snr_age_s = reading.snr_db, reading.age_s
-        return request
-
 
 def _check_deadline(deadline_s: float) -> float:
     if not (math.isfinite(deadline_s) and deadline_s > 0.0):
         raise ValueError(f"expected a deadline_s > 0 in seconds, got {deadline_s!r}")
     return deadline_s
-
-
-def _session_name(session_id: str | None) -> str:
-    # The random part keeps a restarted robot from being answered out of the record that the
-    # server holds of its former life.
-    name, nonce = session_id or "robot", secrets.token_hex(4)
-    if not _SESSION_NAME.fullmatch(name):
-        raise ValueError(
-            "expected a session_id of 1 to 100 letters, digits or ._:@/+=- that begins with a "
-            f"letter or digit, got {session_id!r}"
-        )
-    return f"{name}.{nonce}"
