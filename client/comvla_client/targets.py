@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from contextlib import suppress
 from dataclasses import dataclass
 
 from comvla.errors import HandshakeError
@@ -33,7 +34,7 @@ def is_fleet(target: str) -> bool:
 
 
 class Addresses:
-    """The servers that a target names.
+    """The servers that a target names. A name that a look-up fails for keeps those that it had.
 
     Args:
         target: ``host:port`` or ``dns:///name:port``, once or more with commas between.
@@ -52,6 +53,7 @@ class Addresses:
             channel.check_target(part.removeprefix(DNS))
         self._fixed = [Address(part) for part in parts if not part.startswith(DNS)]
         self._named = [part.removeprefix(DNS) for part in parts if part.startswith(DNS)]
+        self._known: dict[str, list[Address]] = {}
 
     @property
     def change(self) -> bool:
@@ -59,16 +61,21 @@ class Addresses:
         return bool(self._named)
 
     def look_up(self) -> list[Address]:
-        """All servers that there are now, each once. A name that nobody knows stands for none."""
+        """All servers that there are now, each once. A name that nobody ever knew stands for none."""
         found = list(self._fixed)
         for name in self._named:
-            host, _, port = name.rpartition(":")
-            host = host.strip("[]")
-            try:
-                known = socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM)
-            except (OSError, UnicodeError):
-                continue
-            for family, _, _, _, place in known:
-                ip = f"[{place[0]}]" if family == socket.AF_INET6 else place[0]
-                found.append(Address(f"{ip}:{port}", host))
+            # A look-up that fails says nothing of the servers.
+            with suppress(OSError, UnicodeError):
+                self._known[name] = _resolved(name)
+            found += self._known.get(name, [])
         return list(dict.fromkeys(found))[:_MOST]
+
+
+def _resolved(name: str) -> list[Address]:
+    host, _, port = name.rpartition(":")
+    host = host.strip("[]")
+    found = []
+    for family, _, _, _, place in socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM):
+        ip = f"[{place[0]}]" if family == socket.AF_INET6 else place[0]
+        found.append(Address(f"{ip}:{port}", host))
+    return found
