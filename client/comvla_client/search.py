@@ -30,6 +30,7 @@ class Search(Generic[T]):
         self._target = target
         self._attempts = Attempts(timeout_s)
         self._errors: list[TransportError] = []
+        self._asked_again = False
         self.tried: list[Member[T]] = []
 
     def remaining_s(self) -> float:
@@ -43,12 +44,24 @@ class Search(Generic[T]):
     def pause_s(self) -> float:
         """Seconds until those who were merely away may be asked again.
 
+        That is once where another is there and busy: who is away may be so for long, and whoever is busy
+        also said how much it would take, and when.
+
         Raises:
             TransportError: there is no time for that; what was said, and may pass soonest.
         """
         nobody = f"{self._target} stands for no server that is known"
         errors = self._errors or [TransportError("UNAVAILABLE", nobody)]
-        pause_s = self._attempts.pause_s(worst(errors))
+        busy = self._busy()
+        if busy is not None and self._asked_again:
+            raise busy
+        try:
+            pause_s = self._attempts.pause_s(worst(errors))
+        except TransportError as error:
+            if busy is None or busy is error:
+                raise
+            raise busy from error
+        self._asked_again = busy is not None
         self.tried, self._errors = told(self.tried, self._errors)
         return pause_s
 
@@ -59,19 +72,27 @@ class Search(Generic[T]):
             TransportError: no other would, either.
         """
         if error.code not in ELSEWHERE:
-            # Where the server was down already, the clock only cut short the last attempt.
-            failure = worst([*self._errors, error]) if member.down else error
+            failure = error
+            if member.down:
+                # Where the server was down already, the clock only cut short the last attempt.
+                late = error.code == "DEADLINE_EXCEEDED"
+                failure = (self._busy() if late else None) or worst([*self._errors, error])
             if failure is not error:
                 raise failure from error
             self._attempts.pause_s(error)  # raises, and says why the call failed
         self.tried.append(member)
         self._errors.append(error)
 
+    def _busy(self) -> TransportError | None:
+        """What was said by whoever is busy, and has time first."""
+        busy = [error for error in self._errors if error.code == BUSY]
+        return worst(busy) if busy else None
+
 
 def worst(errors: list[TransportError]) -> TransportError:
-    """The failure to tell where every server had one: of several that which may pass soonest.
+    """What to go by where every server had a failure: of several that which may pass soonest.
 
-    A server that is away may be back, and the right one: that the others run another model is told only where
+    A server that is away may be back, and the right one: that the others run another model counts only where
     all of them do, and that they are busy where nobody else is left: of those, who has time first.
     """
 
