@@ -23,9 +23,12 @@ from comvla_client import channel
 from comvla_client.access import TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.line import Line
+from comvla_client.look_up import LookUps
 from comvla_client.revival import PATIENCE_S
 from comvla_client.roster import (
+    LOOK_UP_DOWN_EVERY_S,
     LOOK_UP_EVERY_S,
+    LOOK_UP_NOBODY_EVERY_S,
     PROBE_EVERY_S,
     PROBE_TIMEOUT_S,
     Member,
@@ -51,7 +54,8 @@ class FleetTransport:
 
     Raises:
         HandshakeError: a part of the target is no address.
-        AccessError: certificates or a token that cannot be used.
+        AccessError: certificates or a token that cannot be used; of servers that a name stands for,
+            from the first call that knows them.
     """
 
     def __init__(
@@ -64,7 +68,8 @@ class FleetTransport:
         model: str = "",
     ) -> None:
         self.target = target
-        self._addresses = Addresses(target)
+        addresses = Addresses(target)
+        self._names = LookUps(addresses)
         self._closed = threading.Event()
         self._lock = threading.Lock()
         self._prober: threading.Thread | None = None
@@ -78,7 +83,7 @@ class FleetTransport:
             )
 
         self._roster: Roster[Line] = Roster(make)
-        self._look_up()
+        self._roster.update(addresses.fixed)
 
     def get_model(self, timeout_s: float) -> GetModelResponse:
         """The description that the first server gives which is there.
@@ -122,8 +127,8 @@ class FleetTransport:
 
     def _call(self, work: Work, timeout_s: float) -> Any:
         search = Search(self._roster, self.target, timeout_s)
-        if self._addresses.change and time.monotonic() - self._looked_up > LOOK_UP_EVERY_S:
-            self._look_after(at_once=True)
+        self._check_open()
+        self._look_up(LOOK_UP_EVERY_S)
         while True:
             self._check_open()
             member = search.next()
@@ -131,8 +136,7 @@ class FleetTransport:
                 # Everybody was asked once; those who are merely away may be back.
                 if self._closed.wait(search.pause_s()):
                     raise self._closed_error()
-                if not self._roster.members:
-                    self._look_up()
+                self._look_up(LOOK_UP_NOBODY_EVERY_S)
                 continue
             try:
                 return self._ask(member, work, search.remaining_s(), search.tried)
@@ -227,27 +231,23 @@ class FleetTransport:
         if member.down:
             self._look_after()
 
-    def _look_up(self) -> None:
-        self._looked_up = time.monotonic()
-        for gone in self._roster.update(self._addresses.look_up()):
+    def _look_up(self, every_s: float) -> None:
+        """Takes over what was found meanwhile, and has names looked up again after so many seconds."""
+        for gone in self._roster.update(self._names.news(every_s)):
             gone.transport.close()
 
-    def _look_after(self, *, at_once: bool = False) -> None:
+    def _look_after(self) -> None:
         """Asks servers that are down whether they are well again, in a thread, until all are."""
         with self._lock:
             if self._closed.is_set() or (self._prober is not None and self._prober.is_alive()):
                 return
-            self._prober = threading.Thread(
-                target=self._probe, args=(at_once,), name="comvla-fleet", daemon=True
-            )
+            self._prober = threading.Thread(target=self._probe, name="comvla-fleet", daemon=True)
             self._prober.start()
 
-    def _probe(self, look_up: bool) -> None:
+    def _probe(self) -> None:
         while True:
+            self._look_up(LOOK_UP_DOWN_EVERY_S)
             now = time.monotonic()
-            if self._addresses.change and (look_up or now - self._looked_up > 1.0):
-                self._look_up()
-            look_up = False
             for member in self._roster.down:
                 if member.probe_at <= now and member.transport.is_well():
                     self._roster.back(member)

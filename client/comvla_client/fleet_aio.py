@@ -12,9 +12,12 @@ from comvla_client import channel
 from comvla_client.access import TlsOptions, Token
 from comvla_client.errors import ClientClosedError, TransportError
 from comvla_client.health import check_health_aio
+from comvla_client.look_up import LookUps
 from comvla_client.revival import PATIENCE_S
 from comvla_client.roster import (
+    LOOK_UP_DOWN_EVERY_S,
     LOOK_UP_EVERY_S,
+    LOOK_UP_NOBODY_EVERY_S,
     PROBE_EVERY_S,
     PROBE_TIMEOUT_S,
     Member,
@@ -40,7 +43,8 @@ class FleetAioTransport:
 
     Raises:
         HandshakeError: a part of the target is no address.
-        AccessError: certificates or a token that cannot be used.
+        AccessError: certificates or a token that cannot be used; of servers that a name stands for,
+            from the first call that knows them.
     """
 
     def __init__(
@@ -53,11 +57,11 @@ class FleetAioTransport:
         model: str = "",
     ) -> None:
         self.target = target
-        self._addresses = Addresses(target)
+        addresses = Addresses(target)
+        self._names = LookUps(addresses)
         self._closed = asyncio.Event()
         self._tasks: set[asyncio.Future[Any]] = set()
         self._prober: asyncio.Task[None] | None = None
-        self._looked_up = float("-inf")
 
         def make(address: Address) -> GrpcAioTransport:
             named = None if tls is None else tls.with_server_name(address.server_name)
@@ -66,8 +70,7 @@ class FleetAioTransport:
             )
 
         self._roster: Roster[GrpcAioTransport] = Roster(make)
-        if not self._addresses.change:
-            self._roster.update(self._addresses.look_up())
+        self._roster.update(addresses.fixed)
 
     async def get_model(self, timeout_s: float) -> GetModelResponse:
         """The description that the first server gives which is there.
@@ -115,17 +118,14 @@ class FleetAioTransport:
 
     async def _call(self, work: Work, timeout_s: float) -> Any:
         search = Search(self._roster, self.target, timeout_s)
-        if not self._roster.members:
-            await self._look_up()
-        elif self._addresses.change and time.monotonic() - self._looked_up > LOOK_UP_EVERY_S:
-            self._look_after()
+        self._check_open()
+        await self._look_up(LOOK_UP_EVERY_S)
         while True:
             self._check_open()
             member = search.next()
             if member is None:
                 await asyncio.sleep(search.pause_s())
-                if not self._roster.members:
-                    await self._look_up()
+                await self._look_up(LOOK_UP_NOBODY_EVERY_S)
                 continue
             try:
                 return await self._ask(member, work, search.remaining_s(), search.tried)
@@ -229,10 +229,9 @@ class FleetAioTransport:
         if not task.cancelled():
             task.exception()  # retrieved, even where another answer was quicker
 
-    async def _look_up(self) -> None:
-        self._looked_up = time.monotonic()
-        addresses = await asyncio.to_thread(self._addresses.look_up)
-        for gone in self._roster.update(addresses):
+    async def _look_up(self, every_s: float) -> None:
+        """Takes over what was found meanwhile, and has names looked up again after so many seconds."""
+        for gone in self._roster.update(self._names.news(every_s)):
             await gone.transport.close()
 
     def _look_after(self) -> None:
@@ -242,9 +241,8 @@ class FleetAioTransport:
 
     async def _probe(self) -> None:
         while True:
+            await self._look_up(LOOK_UP_DOWN_EVERY_S)
             now = time.monotonic()
-            if self._addresses.change and now - self._looked_up > 1.0:
-                await self._look_up()
             for member in self._roster.down:
                 if member.probe_at > now or member.calls or not await _is_well(member):
                     continue

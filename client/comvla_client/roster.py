@@ -28,7 +28,13 @@ MOST_PROBED = 2
 """How many others are asked whether they are well where one is silent."""
 
 LOOK_UP_EVERY_S = 30.0
-"""How often a name is looked up again while all is well."""
+"""How often a name is looked up again while all is well, in seconds."""
+
+LOOK_UP_DOWN_EVERY_S = 1.0
+"""The same while a server is down."""
+
+LOOK_UP_NOBODY_EVERY_S = 0.5
+"""The same where a call found nobody."""
 
 BUSY = "RESOURCE_EXHAUSTED"
 """The code of a server that has no time, or not for this robot."""

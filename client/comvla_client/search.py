@@ -29,6 +29,7 @@ class Search(Generic[T]):
         self._roster = roster
         self._target = target
         self._attempts = Attempts(timeout_s)
+        self._nobody = Attempts(timeout_s)  # apart: that nobody was known is not what a server said
         self._errors: list[TransportError] = []
         self._asked_again = False
         self.tried: list[Member[T]] = []
@@ -42,7 +43,7 @@ class Search(Generic[T]):
         return self._roster.pick(self.tried) if self._roster.members else None
 
     def pause_s(self) -> float:
-        """Seconds until those who were merely away may be asked again.
+        """Seconds until those who were merely away may be asked again, or somebody may be known.
 
         That is once where another is there and busy: who is away may be so for long, and whoever is busy
         also said how much it would take, and when.
@@ -50,13 +51,14 @@ class Search(Generic[T]):
         Raises:
             TransportError: there is no time for that; what was said, and may pass soonest.
         """
-        nobody = f"{self._target} stands for no server that is known"
-        errors = self._errors or [TransportError("UNAVAILABLE", nobody)]
+        if not self._errors:
+            nobody = f"{self._target} stands for no server that is known"
+            return self._nobody.pause_s(TransportError("UNAVAILABLE", nobody))
         busy = self._busy()
         if busy is not None and self._asked_again:
             raise busy
         try:
-            pause_s = self._attempts.pause_s(worst(errors))
+            pause_s = self._attempts.pause_s(worst(self._errors))
         except TransportError as error:
             if busy is None or busy is error:
                 raise

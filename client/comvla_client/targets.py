@@ -60,8 +60,16 @@ class Addresses:
         """Whether a name is among them, whose servers come and go."""
         return bool(self._named)
 
+    @property
+    def fixed(self) -> list[Address]:
+        """The servers among them that no name stands for, each once."""
+        return list(dict.fromkeys(self._fixed))
+
     def look_up(self) -> list[Address]:
-        """All servers that there are now, each once. A name that nobody ever knew stands for none."""
+        """All servers that there are now, each once. A name that nobody ever knew stands for none.
+
+        Asks the system's resolver, which may take many seconds.
+        """
         found = list(self._fixed)
         for name in self._named:
             # A look-up that fails says nothing of the servers.

@@ -102,6 +102,20 @@ def test_a_busy_server_is_told_where_the_clock_cut_short_an_attempt_to_one_that_
         assert caught.value is told
 
 
+def test_that_nobody_was_known_at_first_is_not_told_of_a_server_that_is_late() -> None:
+    late = fault("DEADLINE_EXCEEDED")
+    roster: Roster[Nothing] = Roster(lambda address: Nothing())
+    search = Search(roster, "dns:///fleet:1", HOUR_S)
+    assert search.next() is None
+    assert search.pause_s() > 0.0
+    roster.update([Address("host:1")])
+    member = search.next()
+    assert member is not None
+    with pytest.raises(TransportError) as caught:
+        search.failed(member, late)
+    assert caught.value is late
+
+
 def crowded() -> StubService:
     """A server that answers the handshake, has no time, and asks for at most 3 tokens."""
     service = StubService()
