@@ -16,6 +16,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextvars import copy_context
+from functools import partial
 from typing import Any, TypeAlias
 
 from comvla.v1.policy_pb2 import GetModelResponse, InferRequest, InferResponse
@@ -247,16 +248,18 @@ class FleetTransport:
     def _probe(self) -> None:
         while True:
             self._look_up(LOOK_UP_DOWN_EVERY_S)
-            now = time.monotonic()
-            for member in self._roster.down:
-                if member.probe_at <= now and member.transport.is_well():
-                    self._roster.back(member)
+            for member in self._roster.to_probe():
+                answer = member.transport.submit(member.transport.is_well)
+                answer.add_done_callback(partial(self._probed, member))
             with self._lock:
                 if not self._roster.down:
                     self._prober = None
                     return
             if self._closed.wait(PROBE_EVERY_S):
                 return
+
+    def _probed(self, member: _Member, answer: Future[bool]) -> None:
+        self._roster.probed(member, answer.exception() is None and answer.result())
 
     def _check_open(self) -> None:
         if self._closed.is_set():

@@ -240,17 +240,30 @@ class FleetAioTransport:
             self._prober = asyncio.ensure_future(self._probe())
 
     async def _probe(self) -> None:
-        while True:
-            await self._look_up(LOOK_UP_DOWN_EVERY_S)
-            now = time.monotonic()
-            for member in self._roster.down:
-                if member.probe_at > now or member.calls or not await _is_well(member):
-                    continue
+        probes: set[asyncio.Task[None]] = set()
+        try:
+            while True:
+                await self._look_up(LOOK_UP_DOWN_EVERY_S)
+                for member in self._roster.to_probe():
+                    probe = asyncio.ensure_future(self._ask_after(member))
+                    probes.add(probe)
+                    probe.add_done_callback(probes.discard)
+                    probe.add_done_callback(self._forget)
+                if not self._roster.down:
+                    return
+                await asyncio.sleep(PROBE_EVERY_S)
+        finally:
+            for probe in list(probes):
+                probe.cancel()
+
+    async def _ask_after(self, member: _Member) -> None:
+        well = False
+        try:
+            well = await _is_well(member) and not member.calls  # which a new connection would end
+            if well:
                 await member.transport.renew()  # the old connection may still be a silent one
-                self._roster.back(member)
-            if not self._roster.down:
-                return
-            await asyncio.sleep(PROBE_EVERY_S)
+        finally:
+            self._roster.probed(member, well)
 
     def _check_open(self) -> None:
         if self._closed.is_set():

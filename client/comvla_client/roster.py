@@ -16,10 +16,13 @@ from comvla_client.revival import PATIENCE_S, USUAL_TIMES
 from comvla_client.targets import Address
 
 PROBE_EVERY_S = 0.1
-"""Pause between two questions to a server that is down whether it is back, in seconds."""
+"""How often a server that is down is asked whether it is back, in seconds; after each answer at the soonest."""
 
 PROBE_TIMEOUT_S = 0.5
-"""How long each may take."""
+"""How long it may take to answer that."""
+
+PROBED_AT_ONCE = 16
+"""How many servers that are down are asked at the same time: silent ones must not hold up the rest."""
 
 FOREIGN_FOR_S = 30.0
 """How long a server that runs another model is left alone."""
@@ -64,6 +67,8 @@ class Member(Generic[T]):
         transport: calls it.
         down: not to be asked while others are there.
         probe_at: when to ask it whether it is back, on ``time.monotonic``.
+        probed_at: when it was last asked.
+        probing: whether it owes the answer to that.
         calls: under way.
         took_s: seconds of its last answers.
     """
@@ -72,6 +77,8 @@ class Member(Generic[T]):
     transport: T
     down: bool = False
     probe_at: float = 0.0
+    probed_at: float = 0.0
+    probing: bool = False
     calls: int = 0
     took_s: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
 
@@ -174,6 +181,23 @@ class Roster(Generic[T]):
         """A server had better be left alone for so long, and until it says that it is well."""
         member.down, member.probe_at = True, time.monotonic() + pause_s
 
-    def back(self, member: Member[T]) -> None:
-        """It said so."""
-        member.down = False
+    def to_probe(self) -> list[Member[T]]:
+        """Those to ask now whether they are back, few at once, who waited longest first.
+
+        What becomes of each is to be told with :meth:`probed`.
+        """
+        now = time.monotonic()
+        with self._lock:
+            free = PROBED_AT_ONCE - sum(member.probing for member in self._members)
+            due = [m for m in self._members if m.down and not m.probing and m.probe_at <= now]
+            chosen = sorted(due, key=lambda member: member.probed_at)[: max(0, free)]
+            for member in chosen:
+                member.probing, member.probed_at = True, now
+            return chosen
+
+    def probed(self, member: Member[T], well: bool) -> None:
+        """Whether it said that it is well, which counts unless a call to it failed meanwhile."""
+        with self._lock:
+            member.probing = False
+            if well and member.probe_at <= member.probed_at:
+                member.down = False

@@ -144,7 +144,7 @@ def test_the_robot_hears_a_busy_server_while_another_is_gone() -> None:
             check(client.step(OBS, WORDS), client.step(OBS, WORDS))
 
 
-async def test_so_does_the_asyncio_client() -> None:
+async def test_the_asyncio_client_hears_it_too() -> None:
     with serving(crowded()) as (busy, _):
         client = AsyncComVLAClient(
             f"{REFUSED},{busy}", edge=StubEdge(), link=NARROW, budget=4, deadline_s=20.0
