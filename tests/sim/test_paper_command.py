@@ -14,7 +14,15 @@ from comvla_sim import cli
 from comvla_sim.experiments.layouts import evaluation_layout
 from comvla_sim.experiments.plan import EvalSettings
 from comvla_sim.experiments.worker import Worker
-from comvla_sim.paper import cells, film, gathering, kept_tokens, layer_error, measuring
+from comvla_sim.paper import (
+    cells,
+    film,
+    gathering,
+    kept_tokens,
+    latency,
+    layer_error,
+    measuring,
+)
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.kept_tokens import dimmed
 from comvla_sim.worlds.tabletop import Tabletop
@@ -79,6 +87,40 @@ def test_a_table_is_measured_resumed_and_written(
     docs = tmp_path / "docs"
     assert paper(out, "table3", "--measured-only", "--docs", str(docs)) == 0
     assert (docs / "results.md").read_bytes() == (out / "results.md").read_bytes()
+
+
+@pytest.mark.slow
+def test_where_nothing_may_be_measured_a_part_that_is_not_there_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nobody(*_: Any, **__: Any) -> Any:
+        raise AssertionError("something was measured")
+
+    monkeypatch.setattr(Worker, "__init__", nobody)
+    monkeypatch.setattr(latency, "measure_latency", nobody)
+    monkeypatch.setattr(layer_error, "measure_errors", nobody)
+    assert paper(tmp_path, "all", "--measured-only") == 0
+    captured = capsys.readouterr()
+    parts = ("latency", "pictures", "layers", "figure3")
+    assert all(f"{name}: left out" in captured.err for name in parts)
+    printed = json.loads(captured.out)
+    assert not set(parts) & set(printed)
+    assert printed["cells"] == []
+    written = {Path(file).name for file in printed["files"]}
+    assert written == {"results.json", "results.md", "results.html"} == names(tmp_path)
+    text = (tmp_path / "results.md").read_text(encoding="utf-8")
+    assert "## Table II" in text
+    assert not any(f"## {part}" in text for part in ("Table I:", "Table IV", "Fig."))
+
+    for name in ("latency", "pictures"):
+        (tmp_path / f"{name}.json").write_text('{"kept": true}')
+    assert paper(tmp_path, "table1", "--measured-only") == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["latency"] == printed["pictures"] == {"kept": True}
+
+
+def names(folder: Path) -> set[str]:
+    return {file.name for file in folder.iterdir()}
 
 
 @pytest.mark.slow

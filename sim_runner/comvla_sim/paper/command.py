@@ -88,7 +88,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="take over episodes of other runs (runs/figure and runs/eval)",
     )
     parser.add_argument(
-        "--measured-only", action="store_true", help="run no episodes; report those that are there"
+        "--measured-only",
+        action="store_true",
+        help="measure nothing; report what is there, and leave out what is not",
     )
     parser.add_argument(
         "--docs", type=Path, metavar="FOLDER", help="also write the page and its pictures here"

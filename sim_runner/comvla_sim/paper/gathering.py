@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from comvla_sim.bench import environment
 from comvla_sim.experiments.errors import EvaluationError
@@ -53,29 +52,31 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
         data["cells"], data["pairs"] = all_counts(measured), all_pairs(measured)
     inside = plan.target is None
     if inside and {"table1", "table2"} & set(tables):
-        data["latency"] = _kept_or(plan, "latency", lambda: _latency(study))
+        data |= _kept_or(plan, "latency", lambda: _latency(study))
     if inside and "table1" in tables and plan.world != "libero":
-        data["pictures"] = _kept_or(plan, "pictures", lambda: _pictures(plan, study, data))
+        data |= _kept_or(plan, "pictures", lambda: _pictures(plan, study, data))
     if inside and "table4" in tables:
-        data["layers"] = _kept_or(plan, "layers", lambda: _layers(study))
+        data |= _kept_or(plan, "layers", lambda: _layers(study))
     if inside and "fig3" in parts:
-        data["figure3"] = _kept_or(plan, "figure3", lambda: _figure3(plan, study))
+        data |= _kept_or(plan, "figure3", lambda: _figure3(plan, study))
     for part in (part for part in parts if part in SWEEP_OF):
         data[SWEEP_OF[part]] = _sweep(plan, study, part, quick=quick)
     data["story"] = _story(plan, study, settings, time.monotonic() - began)
     return Results(data)
 
 
-def _kept_or(plan: Plan, name: str, make: Any) -> Json:
-    """A part that takes seconds: measured anew, or as it was measured last where nothing may run."""
+def _kept_or(plan: Plan, name: str, make: Callable[[], Json]) -> Json:
+    """A part under its name: measured anew or, where nothing may run, as it was measured last, if it ever was."""
     path = plan.out / f"{name}.json"
-    if plan.measured_only and path.exists():
-        found: Json = json.loads(path.read_text(encoding="utf-8"))
-        return found
+    if plan.measured_only:
+        if not path.exists():
+            print(f"{name}: left out, {path} is not there yet", file=sys.stderr)
+            return {}
+        return {name: json.loads(path.read_text(encoding="utf-8"))}
     print(name, file=sys.stderr)
-    made: Json = make()
+    made = make()
     write(path, (json.dumps(made, indent=1) + "\n").encode())
-    return made
+    return {name: made}
 
 
 def _latency(study: Study) -> Json:

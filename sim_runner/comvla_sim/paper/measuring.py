@@ -37,7 +37,7 @@ class Plan:
             start decides (FastV) and what looks inside the model are then left out.
         only: suites of LIBERO to run; empty for all.
         reuse: folders of other runs, whose episodes are taken over.
-        measured_only: run nothing, and report what is there.
+        measured_only: measure nothing, and report what is there.
     """
 
     world: str = "tabletop"
