@@ -19,6 +19,7 @@ from comvla_sim.paper.published import SUITES, TABLE1
 from comvla_sim.paper.results import Results
 from comvla_sim.paper.table1 import tables as table1
 from comvla_sim.paper.tables2to4 import table3, table4
+from comvla_sim.paper.verdicts import Rate, Verdict
 from comvla_sim.report.tables import Table
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -78,6 +79,72 @@ def test_an_unfinished_run_says_so_with_its_counts() -> None:
     assert "Not complete yet" not in markdown(results(a_few_cells()))
 
 
+def claimed(made: Results, words: str) -> tuple[str, Verdict]:
+    """What came out of the claim that holds these words."""
+    ((_, here, verdict),) = (claim for claim in claims.claims(made) if words in claim[0])
+    return here, verdict
+
+
+def test_methods_are_compared_on_the_tables_that_both_were_run_on() -> None:
+    """INT8 loses its last table; FP16, stopped before that one, is no better for it."""
+    measured = a_few_cells()
+    half = Cell("hard_voting", 32, "float16")
+    measured["tabletop", half] = rows(half, 5, 5)
+    made = results(measured)
+    here, _ = claimed(made, "INT8 costs nothing")
+    assert here.startswith("0.0 points (")
+    assert here.endswith("10 episodes of each")
+    int8 = line(table4(made)[0], "int8")
+    assert int8["change"] == "0.0"
+    assert int8["here, %"].startswith("95.0")
+    assert "the same tables as far as both were run" in markdown(made)
+    assert "the same tables for every method." in markdown(results(a_few_cells()))
+
+
+def test_as_many_episodes_on_other_tables_are_not_compared() -> None:
+    measured = a_few_cells()
+    full, lot = Cell("full"), Cell("random", 32)
+    seeds = sorted({row["layout_seed"] for row in measured["tabletop", full]})
+    for cell, own in ((full, seeds[:10]), (lot, seeds[10:])):
+        kept = [row for row in measured["tabletop", cell] if row["layout_seed"] in own]
+        measured["tabletop", cell] = kept
+    made = results(measured)
+    assert made.shared(full, lot) is None
+    assert not made.same_tables
+    random = line(table1(made)[0], "random", "32")
+    assert random["verdict"] == "cannot be tested here: no table was run with both yet"
+    assert random["change"] == "–"
+
+
+def test_shared_rates_are_those_of_either_order_and_of_each_suite() -> None:
+    full, hard = Cell("full"), Cell("hard_voting", 32)
+    measured = {(suite, full): rows(full, 18, 20, suite) for suite in SUITES}
+    measured |= {(suite, hard): rows(hard, 9, 10, suite) for suite in SUITES[:2]}
+    made = results(measured, world="libero")
+    assert made.shared(hard, full) == (Rate(36, 40), Rate(40, 40))
+    assert made.shared(full, hard) == (Rate(40, 40), Rate(36, 40))
+    assert made.shared(hard, full, SUITES[0]) == (Rate(18, 20), Rate(20, 20))
+    assert made.shared(hard, full, SUITES[2]) is None
+    spatial = next(table for table in table1(made) if table.title == "Success, Spatial")
+    assert line(spatial, "hard_voting", "32")["change"] == "-10.0"
+
+
+def test_a_claim_and_the_table_about_it_have_the_same_verdict() -> None:
+    measured = a_few_cells()
+    for cell in (Cell("deepjscc-10"), Cell("witt-10")):
+        measured["tabletop", cell] = rows(cell, 12, 20)
+    made = results(measured)
+    success, formats = table1(made)[0], table4(made)[0]
+    for words, row in (
+        ("1.5 points", line(success, "hard_voting", "32")),
+        ("Hard votes beat soft", line(table3(made)[0], "K = 32")),
+        ("INT8 costs", line(formats, "int8")),
+        ("INT4 costs", line(formats, "int4")),
+        ("DeepJSCC and WITT", line(success, "deepjscc-10")),
+    ):
+        assert claimed(made, words)[1].text == row["verdict"], words
+
+
 def test_what_was_not_measured_makes_no_claim() -> None:
     made = [claim for claim, _, _ in claims.claims(results(a_few_cells()))]
     assert any("1.5 points" in claim for claim in made)
@@ -120,7 +187,7 @@ def test_results_of_another_version_are_refused(tmp_path: Path) -> None:
     made.save(path)
     assert Results.load(path).data == made.data
     path.write_text('{"format": 99}')
-    with pytest.raises(EvaluationError, match="format 1"):
+    with pytest.raises(EvaluationError, match="format 2"):
         Results.load(path)
     with pytest.raises(EvaluationError, match="cannot read"):
         Results.load(tmp_path / "none.json")

@@ -172,14 +172,15 @@ def counted(suite: str, cell: Cell, rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def paired(first: Sequence[Row], second: Sequence[Row]) -> dict[str, Any]:
-    """Exact McNemar test on the episodes that both cells have."""
+    """Exact McNemar test on the episodes that both cells have, and in how many of them both succeeded."""
     outcomes = {_episode(row): bool(row["success"]) for row in second}
     pairs = [
         (bool(row["success"]), outcomes[_episode(row)])
         for row in first
         if _episode(row) in outcomes
     ]
-    return vars(mcnemar([a for a, _ in pairs], [b for _, b in pairs]))
+    test = mcnemar([a for a, _ in pairs], [b for _, b in pairs])
+    return {**vars(test), "both": sum(a and b for a, b in pairs)}
 
 
 def _episode(row: Row) -> tuple[str, int, str]:
@@ -193,18 +194,21 @@ def all_counts(measured: Measured) -> list[dict[str, Any]]:
 
 def all_pairs(measured: Measured) -> list[dict[str, Any]]:
     """The comparisons that the tables rest on: with random, with soft voting, with all tokens, with our own votes
-    at the same K, and between number formats; all suites together.
+    at the same K, and between number formats; all suites together (``suite`` None), and each of LIBERO's.
     """
     cells = list(dict.fromkeys(cell for _, cell in measured))
+    suites = dict.fromkeys(suite for suite, _ in measured if suite in SUITES)
     found = []
     for first in cells:
         for second in cells:
             if not _compared(first, second):
                 continue
-            rows = [_pooled(measured, cell) for cell in (first, second)]
-            test = paired(rows[0], rows[1])
-            if test["pairs"]:
-                found.append({"first": vars(first), "second": vars(second), **test})
+            for suite in (None, *suites):
+                rows = [_pooled(measured, cell, suite) for cell in (first, second)]
+                test = paired(rows[0], rows[1])
+                if test["pairs"]:
+                    of = {"first": vars(first), "second": vars(second), "suite": suite}
+                    found.append({**of, **test})
     return found
 
 
@@ -212,7 +216,7 @@ def _compared(first: Cell, second: Cell) -> bool:
     if first == second:
         return False
     if first.method == second.method == "hard_voting" and first.k == second.k:
-        return second.quantization == "int8"
+        return second.quantization in ("int8", "float16")
     if first.quantization != second.quantization:
         return False
     if second.method == "full":
@@ -222,5 +226,12 @@ def _compared(first: Cell, second: Cell) -> bool:
     )
 
 
-def _pooled(measured: Mapping[tuple[str, Cell], list[Row]], cell: Cell) -> list[Row]:
-    return [row for (_, own), rows in measured.items() if own == cell for row in rows]
+def _pooled(
+    measured: Mapping[tuple[str, Cell], list[Row]], cell: Cell, suite: str | None
+) -> list[Row]:
+    return [
+        row
+        for (where, own), rows in measured.items()
+        if own == cell and suite in (None, where)
+        for row in rows
+    ]

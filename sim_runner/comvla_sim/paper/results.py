@@ -12,7 +12,7 @@ from comvla_sim.experiments.statistics import wilson_interval
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.verdicts import Rate
 
-FORMAT = 1
+FORMAT = 2
 
 Json = dict[str, Any]
 
@@ -71,13 +71,35 @@ class Results:
         found = self.find(cell, suite)
         return None if found is None else Rate(found["successes"], found["episodes"])
 
-    def pair(self, first: Cell, second: Cell) -> Json | None:
-        """The paired test of two cells, in this order."""
+    def pair(self, first: Cell, second: Cell, suite: str | None = None) -> Json | None:
+        """The paired test of two cells, in this order: of one of LIBERO's suites, or of all together."""
         for test in self.data["pairs"]:
-            if Cell(**test["first"]) == first and Cell(**test["second"]) == second:
+            cells = Cell(**test["first"]), Cell(**test["second"])
+            if cells == (first, second) and test["suite"] == suite:
                 found: Json = test
                 return found
         return None
+
+    def shared(
+        self, first: Cell, second: Cell, suite: str | None = None
+    ) -> tuple[Rate, Rate] | None:
+        """Success rates of two cells on the episodes that both have; None where there are none."""
+        turned = self.pair(second, first, suite)
+        test = self.pair(first, second, suite) or turned
+        if test is None:
+            return None
+        rates = [
+            Rate(test["both"] + test[only], test["pairs"]) for only in ("only_first", "only_second")
+        ]
+        return (rates[1], rates[0]) if test is turned else (rates[0], rates[1])
+
+    @property
+    def same_tables(self) -> bool:
+        """Whether every cell has the same episodes, so that no comparison leaves any out."""
+        counts = {found["episodes"] for cell in self.cells if (found := self.find(cell))}
+        return len(counts) <= 1 and all(
+            test["pairs"] in counts for test in self.data["pairs"] if test["suite"] is None
+        )
 
     def latency(self, cell: Cell) -> Json | None:
         """Median times of a query."""

@@ -6,6 +6,14 @@ from collections.abc import Iterator
 
 from comvla_sim.experiments.methods import order, shown_k
 from comvla_sim.paper.cells import BUDGETS, PAPER_CELLS, Cell
+from comvla_sim.paper.changes import (
+    ALL_EPISODES,
+    STAND_IN,
+    change,
+    change_text,
+    change_verdict,
+    gap_text,
+)
 from comvla_sim.paper.published import (
     EPISODES_PER_SUITE,
     SUITE_NAMES,
@@ -19,9 +27,7 @@ from comvla_sim.paper.verdicts import (
     UNTESTED,
     Rate,
     Verdict,
-    compare_changes,
     compare_rates,
-    contrast,
 )
 from comvla_sim.report.tables import Table
 
@@ -33,9 +39,6 @@ OTHER_LEVEL = Verdict(
 )
 OTHER_MACHINE = Verdict(UNTESTED, "needs an H100 and the 7.5 G model")
 OTHER_WEIGHTS = Verdict(UNTESTED, "how many tokens it keeps depends on trained weights")
-STAND_IN = Verdict(UNTESTED, "drawn with stand-in assets")
-
-_ALL = EPISODES_PER_SUITE * len(SUITES)
 
 
 def lines(results: Results) -> list[tuple[Cell, PaperLine | None]]:
@@ -66,11 +69,6 @@ def rate_text(rate: Rate | None) -> str:
     return f"{100 * rate.value:.1f} ({100 * low:.1f}–{100 * high:.1f})"
 
 
-def change_text(value: float) -> str:
-    """Points with their sign; none for no change."""
-    return f"{value:+.1f}" if abs(value) >= 0.05 else "0.0"
-
-
 def success_verdict(
     results: Results, cell: Cell, reference: Cell, paper: PaperLine | None, suite: str | None
 ) -> Verdict:
@@ -86,17 +84,16 @@ def success_verdict(
         return compare_rates(_published(paper, suite), ours)
     if cell == reference:
         return OTHER_LEVEL
-    base = results.rate(reference, suite)
-    if base is None:
+    if results.rate(reference, suite) is None:
         return Verdict(UNTESTED, "its reference is not measured yet")
     level = TABLE1[PAPER_CELLS[reference]]
-    return compare_changes((_published(paper, suite), _published(level, suite)), (ours, base))
+    printed = _percent(paper, suite), _percent(level, suite)
+    return change_verdict(results, (cell, reference), printed, suite)
 
 
 def _published(line: PaperLine, suite: str | None) -> Rate:
-    if suite in SUITES:
-        return Rate.of_percent(line.success[SUITES.index(suite)], EPISODES_PER_SUITE)
-    return Rate.of_percent(line.average, _ALL)
+    episodes = EPISODES_PER_SUITE if suite in SUITES else ALL_EPISODES
+    return Rate.of_percent(_percent(line, suite), episodes)
 
 
 def tables(results: Results) -> list[Table]:
@@ -110,14 +107,13 @@ def tables(results: Results) -> list[Table]:
 
 def _success(results: Results, suite: str | None) -> Table:
     where = f", {SUITE_NAMES[suite]}" if suite else ""
-    full = results.rate(FULL, suite)
     rows = []
     for cell, paper in lines(results):
         ours = results.rate(cell, suite)
         theirs = None if paper is None else _percent(paper, suite)
         level = _percent(TABLE1["full", None], suite)
         found = results.find(cell, suite)
-        change = 100 * (ours.value - full.value) if ours and full else None
+        moved = change(results, cell, FULL, suite) if ours else None
         rows.append(
             (
                 cell.method,
@@ -125,7 +121,7 @@ def _success(results: Results, suite: str | None) -> Table:
                 DASH if theirs is None else f"{theirs:.1f}",
                 DASH if theirs is None else change_text(theirs - level),
                 rate_text(ours),
-                DASH if change is None else change_text(change),
+                DASH if moved is None else change_text(moved),
                 success_verdict(results, cell, FULL, paper, suite).text,
                 DASH if ours is None else str(ours.episodes),
                 _hits(found),
@@ -133,7 +129,8 @@ def _success(results: Results, suite: str | None) -> Table:
         )
     return Table(
         f"Success{where}",
-        "Percent of episodes, with Wilson's 95 % interval; change in points from all 512 tokens. "
+        "Percent of episodes, with Wilson's 95 % interval; change in points from all 512 tokens, on the tables that "
+        "both were run on. "
         + (
             "The verdict compares the rates."
             if results.libero
@@ -170,25 +167,20 @@ def _against_random(results: Results) -> Table:
     rows = []
     for k in (*BUDGETS, 4):
         hard, lot = Cell("hard_voting", k), Cell("random", k)
-        ours, test = (results.rate(hard), results.rate(lot)), results.pair(hard, lot)
-        if ours[0] is None or ours[1] is None or test is None:
+        ours, test = results.shared(hard, lot), results.pair(hard, lot)
+        if ours is None or test is None:
             continue
-        value, low, high = (100 * x for x in contrast([(1, ours[0]), (-1, ours[1])]))
         theirs = [TABLE1.get((method, k)) for method in ("hard_voting", "random")]
         gap, verdict = DASH, Verdict(OURS)
         if theirs[0] and theirs[1]:
-            gap = change_text(theirs[0].average - theirs[1].average)
-            rates = [Rate.of_percent(line.average, _ALL) for line in theirs if line]
-            verdict = (
-                STAND_IN
-                if results.stand_in
-                else compare_changes((rates[0], rates[1]), (ours[0], ours[1]))
-            )
+            printed = theirs[0].average, theirs[1].average
+            gap = change_text(printed[0] - printed[1])
+            verdict = change_verdict(results, (hard, lot), printed)
         rows.append(
             (
                 f"K = {k}",
                 gap,
-                f"{change_text(value)} ({low:+.1f} to {high:+.1f})",
+                gap_text(ours),
                 str(test["pairs"]),
                 str(test["only_first"]),
                 str(test["only_second"]),
@@ -198,9 +190,9 @@ def _against_random(results: Results) -> Table:
         )
     return Table(
         "Hard voting against random tokens at equal K",
-        "Points of success by which hard voting is ahead; pairs on the same tables, and in how many only one of the "
-        "two "
-        "succeeded (exact McNemar test, two-sided, not corrected for the number of tests).",
+        "Points of success by which hard voting is ahead on the tables that both were run on; how many pairs that "
+        "are, and in how many only one of the two succeeded (exact McNemar test, two-sided, not corrected for the "
+        "number of tests).",
         ("", "paper", "here", "pairs", "only hard voting", "only random", "p", "verdict"),
         tuple(rows),
     )

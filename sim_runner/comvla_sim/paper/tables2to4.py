@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from comvla_sim.paper import analytic
 from comvla_sim.paper.cells import Cell
+from comvla_sim.paper.changes import (
+    ALL_EPISODES,
+    STAND_IN,
+    change,
+    change_text,
+    change_verdict,
+    gap_text,
+)
 from comvla_sim.paper.published import (
     EPISODES_PER_SUITE,
     SUITE_NAMES,
@@ -14,27 +22,17 @@ from comvla_sim.paper.published import (
     TABLE_K,
 )
 from comvla_sim.paper.results import Json, Results
-from comvla_sim.paper.table1 import (
-    DASH,
-    FULL,
-    OTHER_MACHINE,
-    STAND_IN,
-    change_text,
-    rate_text,
-)
+from comvla_sim.paper.table1 import DASH, FULL, OTHER_MACHINE, rate_text
 from comvla_sim.paper.verdicts import (
     OURS,
     UNTESTED,
     Rate,
     Verdict,
-    compare_changes,
     compare_number,
     compare_rates,
-    contrast,
 )
 from comvla_sim.report.tables import Table
 
-_ALL = EPISODES_PER_SUITE * len(SUITES)
 _VOTED = Cell("hard_voting", TABLE_K)
 _NOT_YET = Verdict(UNTESTED, "not measured yet")
 
@@ -96,27 +94,21 @@ def table3(results: Results) -> list[Table]:
     rows = []
     for k in (TABLE_K, 16, 8, 4):
         hard, soft = Cell("hard_voting", k), Cell("soft_voting", k)
-        ours, test = (results.rate(hard), results.rate(soft)), results.pair(soft, hard)
-        if ours[0] is None or ours[1] is None or test is None:
+        ours, test = results.shared(hard, soft), results.pair(soft, hard)
+        if ours is None or test is None:
             continue
-        value, low, high = (100 * x for x in contrast([(1, ours[0]), (-1, ours[1])]))
         gap, verdict = DASH, Verdict(OURS)
         if k == TABLE_K:
-            printed = [TABLE3[name][1] for name in ("hard_voting", "soft_voting")]
+            printed = TABLE3["hard_voting"][1], TABLE3["soft_voting"][1]
             gap = change_text(printed[0] - printed[1])
-            rates = [Rate.of_percent(value, _ALL) for value in printed]
-            verdict = (
-                STAND_IN
-                if results.stand_in
-                else compare_changes((rates[0], rates[1]), (ours[0], ours[1]))
-            )
+            verdict = change_verdict(results, (hard, soft), printed)
         rows.append(
             (
                 f"K = {k}",
-                rate_text(ours[0]),
-                rate_text(ours[1]),
+                rate_text(results.rate(hard)),
+                rate_text(results.rate(soft)),
                 gap,
-                f"{change_text(value)} ({low:+.1f} to {high:+.1f})",
+                gap_text(ours),
                 str(test["pairs"]),
                 f"{test['only_second']} : {test['only_first']}",
                 f"{test['p_value']:.1g}",
@@ -131,9 +123,9 @@ def table3(results: Results) -> list[Table]:
     ]
     voting = Table(
         "Hard against soft voting",
-        "Percent of episodes with Wilson's 95 % intervals; points by which hard voting is ahead; pairs on the same "
-        "tables "
-        "in which only hard or only soft voting succeeded (exact McNemar test).",
+        "Percent of episodes with Wilson's 95 % intervals; points by which hard voting is ahead on the tables that "
+        "both were run on; how many pairs that are, and in how many only hard or only soft voting "
+        "succeeded (exact McNemar test).",
         (
             "",
             "hard",
@@ -171,12 +163,11 @@ def table4(results: Results) -> list[Table]:
     """Number formats of the tokens, and where each does its damage."""
     rows = []
     reference = Cell("hard_voting", TABLE_K, "float16")
-    base = results.rate(reference)
     for quantization, (kib, _, average) in TABLE4.items():
         cell = Cell("hard_voting", TABLE_K, quantization)
         ours, calculated = results.rate(cell), analytic.payload_kib(TABLE_K, quantization)
         found, test = results.find(cell), results.pair(cell, _VOTED)
-        change = 100 * (ours.value - base.value) if ours and base else None
+        moved = change(results, cell, reference) if ours and results.rate(reference) else None
         rows.append(
             (
                 quantization,
@@ -185,8 +176,8 @@ def table4(results: Results) -> list[Table]:
                 f"{average:.1f}",
                 change_text(average - TABLE4["float16"][2]),
                 rate_text(ours),
-                DASH if change is None else change_text(change),
-                _format_verdict(results, cell, average, ours, base),
+                DASH if moved is None else change_text(moved),
+                _format_verdict(results, cell, reference, ours),
                 DASH if ours is None else str(ours.episodes),
                 DASH if test is None else f"{test['p_value']:.1g}",
                 DASH if found is None else f"{found['wire_bytes'] / analytic.KIB:.2f}",
@@ -200,8 +191,8 @@ def table4(results: Results) -> list[Table]:
     ]
     formats = Table(
         f"Number formats at K = {TABLE_K}",
-        "KiB as in Table I; percent of episodes with Wilson's 95 % intervals; change in points from float16; p of the "
-        "paired test against int8.",
+        "KiB as in Table I; percent of episodes with Wilson's 95 % intervals; change in points from float16, on the "
+        "tables that both were run on; p of the paired test against int8.",
         (
             "format",
             "paper, KiB",
@@ -220,19 +211,18 @@ def table4(results: Results) -> list[Table]:
     return [formats, *_suites_table(by_suite), *_layers(results.data.get("layers"))]
 
 
-def _format_verdict(
-    results: Results, cell: Cell, average: float, ours: Rate | None, base: Rate | None
-) -> str:
-    if ours is None or base is None:
+def _format_verdict(results: Results, cell: Cell, reference: Cell, ours: Rate | None) -> str:
+    if ours is None or results.rate(reference) is None:
         return _NOT_YET.text
     if results.stand_in:
         return STAND_IN.text
-    paper = Rate.of_percent(average, _ALL)
+    average = TABLE4[cell.quantization][2]
     if results.libero:
-        return compare_rates(paper, ours).text
-    if cell.quantization == "float16":
+        return compare_rates(Rate.of_percent(average, ALL_EPISODES), ours).text
+    if cell == reference:
         return Verdict(UNTESTED, "the level that the others are compared with").text
-    return compare_changes((paper, Rate.of_percent(TABLE4["float16"][2], _ALL)), (ours, base)).text
+    printed = average, TABLE4[reference.quantization][2]
+    return change_verdict(results, (cell, reference), printed).text
 
 
 def _layers(found: Json | None) -> list[Table]:
