@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from comvla_sim.paper.changes import gap_text
 from comvla_sim.paper.verdicts import AGREES, DIFFERS, Rate, Verdict, contrast
 
@@ -15,6 +17,11 @@ NEGLIGIBLE = 0.03
 def gap(first: Rate, second: Rate) -> str:
     """By how much the first rate is ahead, in words."""
     return gap_text((first, second), " points")
+
+
+def worst(verdicts: Sequence[Verdict]) -> Verdict:
+    """What a claim of several parts comes to: its first part that does not agree, else its first."""
+    return next((verdict for verdict in verdicts if verdict.kind != AGREES), verdicts[0])
 
 
 def ahead(first: Rate, second: Rate) -> Verdict:
