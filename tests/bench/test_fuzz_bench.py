@@ -9,9 +9,10 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import grpc
 import pytest
 
-from comvla_sim.fuzz import connections
+from comvla_sim.fuzz import connections, over_socket
 from comvla_sim.fuzz.cases import KINDS, Case
 from comvla_sim.fuzz.in_process import run_one
 from comvla_sim.fuzz.outcome import Tally
@@ -124,3 +125,37 @@ def test_single_cases_are_repeated_in_this_process(kind: str) -> None:
     tally = run_one(case)
     assert tally.kinds[kind] == 1
     assert tally.failures == []
+
+
+@pytest.mark.parametrize(("rise_mib", "grew"), [(0.0, False), (100.0, True)])
+def test_memory_that_only_swings_has_not_grown(rise_mib: float, grew: bool) -> None:
+    watch = Watch("swings", 0)
+    for i in range(101):
+        swing = 40.0 if i % 2 else 0.0
+        watch.samples.append((i / 100, int((400.0 + swing + rise_mib * i / 100) * 2**20), 20))
+    assert watch.verdict()["grew"] is grew
+
+
+@pytest.mark.parametrize(("hidden", "failed"), [(2, 0), (100, 1)])
+def test_an_answer_that_grpc_hides_from_its_own_client_is_asked_for_again(
+    hidden: int, failed: int
+) -> None:
+    answers = iter([(grpc.StatusCode.INTERNAL, "Internal error from Core")] * hidden)
+
+    class Channel:
+        def unary_unary(self, method: str) -> None:
+            return None
+
+        def stream_unary(self, method: str) -> Any:
+            async def call(messages: Any, timeout: float) -> bytes:
+                code, words = next(answers, (grpc.StatusCode.INVALID_ARGUMENT, "no head"))
+                empty = grpc.aio.Metadata()
+                raise grpc.aio.AioRpcError(code, empty, empty, details=words)
+
+            return call
+
+    tally = Tally()
+    case = next(c for c in (Case(0, n) for n in range(2000)) if c.kind == "socket streams")
+    asyncio.run(over_socket._Caller(Channel(), tally).run(case))  # type: ignore[arg-type]
+    assert tally.failed == failed
+    assert tally.kinds["socket streams"] == 1

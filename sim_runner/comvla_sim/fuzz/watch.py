@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 # What may be left of growth after the warm-up: caches that were not full yet, and the allocator.
@@ -40,11 +41,16 @@ class Watch:
         self.samples.append((share, pages * os.sysconf("SC_PAGE_SIZE"), descriptors))
 
     def verdict(self) -> dict[str, Any]:
-        """Resident memory and descriptors when warm and at the end, and whether they grew."""
+        """Resident memory and descriptors in the second and the last quarter, and whether they grew."""
         warm = [sample for sample in self.samples if sample[0] >= _WARM_SHARE]
         if len(warm) < 2:
             return {"name": self.name, "measured": False, "grew": False}
-        (_, resident, descriptors), (_, resident_end, descriptors_end) = warm[0], warm[-1]
+        # Large requests come and go, so one sample may be 10 % above the next: quarters are compared.
+        early = [sample for sample in warm if sample[0] < 2 * _WARM_SHARE] or warm[:1]
+        late = [sample for sample in warm if sample[0] >= 1.0 - _WARM_SHARE] or warm[-1:]
+        resident = int(median(sample[1] for sample in early))
+        resident_end = min(int(median(sample[1] for sample in late)), warm[-1][1])
+        descriptors, descriptors_end = early[0][2], warm[-1][2]
         room = max(_GROWTH_BYTES, _GROWTH_SHARE * resident)
         return {
             "name": self.name,
