@@ -164,6 +164,17 @@ def test_everything_has_a_name_and_a_role(page: Visit) -> None:
     assert page.page.locator("tbody th[scope=row]").count() == 3
 
 
+@pytest.mark.parametrize("width", [400, 800, 1000, 1120, 1280, 1440, 1920])
+def test_the_table_stays_within_its_card(page: Visit, width: int) -> None:
+    page.page.set_viewport_size({"width": width, "height": 900})
+    beyond = page.page.evaluate(
+        """document.getElementById("robots-table").getBoundingClientRect().right
+          - document.getElementById("robots").getBoundingClientRect().right"""
+    )
+    assert beyond < 0
+    assert page.sideways() == 0
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_a_phone(
     visit: Callable[..., Visit], server: BackgroundServer, robot: Robot, scheme: str
