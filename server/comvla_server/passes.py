@@ -123,9 +123,8 @@ class Passes:
             passes = await self._thread.run(
                 run_pass, self._engine, requests, self._metrics, self._clock
             )
-        except (
-            Exception
-        ) as error:  # not even a SystemExit inside a model may end the batcher's loop
+        # The thread makes one of a SystemExit, too: nothing inside a model may end the batcher's loop.
+        except Exception as error:
             self._metrics.model_errors.inc()
             passes = [Pass(error, len(batch), 0.0, 0.0)] * len(batch)
         ended_s = self._clock()

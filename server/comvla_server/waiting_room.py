@@ -61,9 +61,8 @@ class WaitingRoom:
         """
         place, evicted = self._find_place(session_id, work, deadline_s, now_s, self._load.let_in)
         if evicted is not None:
-            self.take(evicted)
-            self._load.note_unanswered(evicted.place, now_s)
-            evicted.resolve(self._full(now_s, Reason.FAIR_SHARE, "open fewer sessions at once"))
+            refusal = self._full(now_s, Reason.FAIR_SHARE, "open fewer sessions at once")
+            self.drop(evicted, now_s, refusal)
         return place
 
     def glance(self, deadline_s: float, now_s: float) -> Refusal | None:
@@ -102,11 +101,17 @@ class WaitingRoom:
         session.queued = None
         return session
 
-    def drop(self, ticket: Ticket, now_s: float) -> None:
-        """Takes an observation that waits out of the room, unanswered."""
+    def drop(self, ticket: Ticket, now_s: float, why: Refusal | None = None) -> None:
+        """Takes an observation that waits out of the room, unanswered.
+
+        Args:
+            ticket: of the observation.
+            now_s: the time.
+            why: what its callers are told; that it is too late where None.
+        """
         self.take(ticket)
         self._load.note_unanswered(ticket.place, now_s)
-        ticket.resolve(too_late(ticket))
+        ticket.resolve(too_late(ticket) if why is None else why)
 
     def clear(self) -> None:
         """Nobody waits any more."""
