@@ -93,6 +93,7 @@ class SlowByTokens(StubCloud):
 def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics() -> None:
     cloud, settings = SlowByTokens(), ServerSettings(advise_least_tokens=1, max_batch=2)
     advised = threading.Event()
+    loads: list[float] = []  # while robots ask: it fades as soon as they stop
     with BackgroundServer(Engine(cloud), settings) as server:
 
         def keep_asking(name: str) -> None:
@@ -100,6 +101,7 @@ def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics()
                 for step in range(1000):
                     # About three passes: with four robots, deadlines are in danger.
                     call = robot.send(message(name, step, k=16), timeout_s=0.1)
+                    loads.append(sample(server, "offered_load_ratio"))
                     if call.exception() is None and 0 < call.result().load.suggested_tokens < 16:
                         advised.set()
                     if advised.is_set():
@@ -111,7 +113,7 @@ def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics()
         for thread in threads:
             thread.join()
         assert advised.is_set()
-        assert sample(server, "offered_load_ratio") > 0.8
+        assert max(loads) > 0.8
         assert 0 < sample(server, "suggested_tokens") < 16
         assert sample(server, "predicted_wait_seconds_count") >= 8
 
