@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 
 import pytest
@@ -10,17 +9,6 @@ from server_stubs import Robot, StubCloud
 
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
-
-
-@pytest.fixture
-def logging_as_it_was() -> Iterator[None]:
-    """Undoes what the command line does to the process's logging."""
-    root, uvicorn = logging.getLogger(), logging.getLogger("uvicorn")
-    handlers, level, uvicorn_level = root.handlers[:], root.level, uvicorn.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    uvicorn.setLevel(uvicorn_level)
 
 
 @pytest.fixture

@@ -173,7 +173,6 @@ def serve_here(
     return code
 
 
-@pytest.mark.usefixtures("logging_as_it_was")
 def test_calls_that_outlast_the_grace_are_an_exit_code(
     monkeypatch: pytest.MonkeyPatch, cloud: StubCloud, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -193,7 +192,6 @@ def test_calls_that_outlast_the_grace_are_an_exit_code(
     assert any("cut off" in event["message"] for event in events)
 
 
-@pytest.mark.usefixtures("logging_as_it_was")
 def test_a_signal_while_the_model_loads_ends_the_process(
     monkeypatch: pytest.MonkeyPatch, cloud: StubCloud, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,7 +202,6 @@ def test_a_signal_while_the_model_loads_ends_the_process(
     assert "Traceback" not in stderr
 
 
-@pytest.mark.usefixtures("logging_as_it_was")
 def test_a_server_that_grpc_has_left_ends_with_code_1(
     monkeypatch: pytest.MonkeyPatch, cloud: StubCloud
 ) -> None:
@@ -232,7 +229,6 @@ def test_a_server_that_grpc_has_left_ends_with_code_1(
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
-@pytest.mark.usefixtures("logging_as_it_was")
 def test_a_hangup_while_the_model_loads_looks_at_tokens_only(
     monkeypatch: pytest.MonkeyPatch, cloud: StubCloud, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -289,7 +285,6 @@ def test_the_real_command_serves_a_checkpoint_until_ctrl_c(checkpoint: Path) -> 
     assert all(json.loads(line)["level"] for line in stderr.splitlines())
 
 
-@pytest.mark.usefixtures("logging_as_it_was")
 def test_a_taken_port_is_exit_code_two_and_one_clear_line(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
@@ -303,7 +298,6 @@ def test_a_taken_port_is_exit_code_two_and_one_clear_line(
     assert len(stderr.splitlines()) == 1
 
 
-@pytest.mark.usefixtures("logging_as_it_was")
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -14,9 +14,6 @@ from comvla_server.log_throttle import LogThrottle
 EVIL = "a\nERROR forged \x1b[31m\u2028line"
 
 
-pytestmark = pytest.mark.usefixtures("logging_as_it_was")
-
-
 def test_json_lines_carry_the_event_and_its_fields() -> None:
     stream = io.StringIO()
     logs.configure("json", "info", stream)

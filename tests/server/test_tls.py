@@ -271,7 +271,6 @@ def test_bad_files_stop_the_start_before_anything_listens(
     assert not any(t.name == "comvla-inference" for t in threading.enumerate())
 
 
-@pytest.mark.usefixtures("logging_as_it_was")
 def test_on_the_command_line_they_are_exit_code_two_and_one_clear_line(
     files: dict[str, Path], authority: Authority, capfd: pytest.CaptureFixture[str]
 ) -> None:

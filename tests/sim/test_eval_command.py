@@ -14,7 +14,7 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.settings import ServerSettings
 from comvla_sim import cli
-from comvla_sim.experiments import command
+from comvla_sim.experiments import command, rollout, worker
 from comvla_sim.experiments.runner import Worker
 from comvla_sim.worlds.tabletop import Tabletop
 from comvla_vla import random_policy
@@ -136,6 +136,36 @@ def test_two_processes_and_a_real_server_measure_the_same_as_one_process(
     assert rows["remote"] == rows["local"]
 
 
+@pytest.mark.parametrize("failures", [1, worker.MOST_TRIES])
+def test_an_episode_starts_again_when_its_server_left_a_query_unanswered(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    failures: int,
+) -> None:
+    monkeypatch.setattr(worker, "PAUSE_S", 0.0)
+    cloud = random_policy(0)[1]
+    predict, left = cloud.predict, [failures]
+
+    def failing_at_first(requests: Any) -> Any:
+        if left[0]:
+            left[0] -= 1
+            raise RuntimeError("out of memory")
+        return predict(requests)
+
+    options = ("--method", "hard_voting", "--k", "16", "--instructions", "drawer-open")
+    with BackgroundServer(Engine(cloud)) as server:
+        cloud.predict = failing_at_first  # type: ignore[method-assign]
+        remote = (*options, "--target", server.target)
+        assert evaluate(tmp_path / "remote.jsonl", *remote) == (2 if failures == worker.MOST_TRIES else 0)
+        told = capsys.readouterr().err
+        assert told.count("the episode starts again") == min(failures, worker.MOST_TRIES - 1)
+        assert "RuntimeError" in told
+        assert evaluate(tmp_path / "remote.jsonl", *remote) == 0, "it goes on as the server does"
+    assert [row["episode"] for row in read(tmp_path / "remote.jsonl")] == [0, 1]
+    assert all(row["fallbacks"] == 0 for row in read(tmp_path / "remote.jsonl"))
+
+
 def test_a_file_of_another_seed_is_not_continued(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,8 +271,9 @@ def test_a_link_that_makes_no_sense_is_refused_before_anything_runs(
 
 
 def test_a_target_that_is_no_address_is_a_message(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(rollout, "CONNECT_TIMEOUT_S", 0.5)
     options = ("--method", "full", "--instructions", "drawer-open", "--target", "nobody")
     assert evaluate(tmp_path / "results.jsonl", *options) == 2
     assert "nobody" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from comvla_client.edge import EdgeModel
 from comvla_client.transport import GrpcTransport
 from comvla_client.transport_protocol import Transport
 from comvla_client.uplink import UplinkForm
-from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.errors import EvaluationError, UnansweredError
 from comvla_sim.experiments.layouts import evaluation_layout, foreign_layout
 from comvla_sim.experiments.link_case import channel_seed
 from comvla_sim.experiments.methods import find_method
@@ -33,6 +33,8 @@ OnQuery: TypeAlias = Callable[[int, StepReport, LinkRecord | None], None]
 # suspended meanwhile. A server of somebody else's may hang.
 _DEADLINE_S = 30 * 86_400.0
 _SERVER_DEADLINE_S = 600.0
+CONNECT_TIMEOUT_S = 15.0
+"""Longest that an episode waits for its server."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,7 @@ def _client(
         budget=budget,
         quantization=settings.quantization,
         deadline_s=_SERVER_DEADLINE_S if settings.target else _DEADLINE_S,
+        connect_timeout_s=CONNECT_TIMEOUT_S,
         seed=seed,
         **options,
     )
@@ -181,7 +184,8 @@ def run_episode(
             client's account, and the link's, where there is one and something was sent.
 
     Raises:
-        EvaluationError: the condition is impossible here, or the server fell silent.
+        EvaluationError: the condition is impossible here.
+        UnansweredError: the server left a query without an answer.
         ObservationError, InstructionError, HandshakeError: world, policy and server do not fit.
     """
     started = time.perf_counter()
@@ -229,7 +233,7 @@ def run_episode(
                 kept = report.positions[: report.tokens_used]
                 statistics.add(kept, None if film else world, roles.spoken)
             elif link is None or report.fallback_reason not in ("no_link", "deadline"):
-                raise EvaluationError(
+                raise UnansweredError(
                     f"the policy gave no answer ({report.fallback_reason}: {report.detail}): check "
                     "the server, then run the same command again"
                 )

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import sys
+import time
 from typing import TYPE_CHECKING, Any
 
-from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.errors import EvaluationError, UnansweredError
 from comvla_sim.experiments.methods import Method, find_method
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
 from comvla_sim.experiments.policy import load_edge_half, load_policy
@@ -18,6 +20,12 @@ if TYPE_CHECKING:
     from comvla_vla import CloudModel
 
 Measured = tuple[EpisodeSpec, dict[str, Any]]
+
+MOST_TRIES = 3
+"""Of an episode, where somebody's server leaves one of its queries without an answer."""
+
+PAUSE_S = 2.0
+"""Before it does, in seconds."""
 
 
 class Worker:
@@ -53,11 +61,29 @@ class Worker:
         self.world: World = make(settings.world, image_size=None if resizes else height)
 
     def run(self, spec: EpisodeSpec, on_query: OnQuery | None = None) -> Measured:
-        """One episode; ``on_query`` as for :func:`comvla_sim.experiments.rollout.run_episode`."""
+        """One episode; ``on_query`` as for :func:`comvla_sim.experiments.rollout.run_episode`.
+
+        A server that others use, too, may turn a query away. Only the answers make an episode, so it
+        starts again, a few times.
+
+        Raises:
+            UnansweredError: it went so each time.
+            EvaluationError, ObservationError, InstructionError, HandshakeError: as ``run_episode``.
+        """
         from comvla_sim.experiments.rollout import run_episode
 
         heard = () if on_query is None else (on_query,)
         target = self.target(find_method(spec.method))
+        # What was told of queries cannot be taken back.
+        again = isinstance(target, str) and on_query is None
+        for _ in range(MOST_TRIES - 1 if again else 0):
+            try:
+                return spec, run_episode(
+                    self.world, self.edge, target, spec, self._settings, *heard
+                )
+            except UnansweredError as error:
+                print(f"{error}; the episode starts again", file=sys.stderr, flush=True)
+                time.sleep(PAUSE_S)
         return spec, run_episode(self.world, self.edge, target, spec, self._settings, *heard)
 
     def target(self, method: Method) -> Transport | str:
