@@ -43,7 +43,7 @@ def test_the_command_of_the_guide_evaluates_it_beside_the_others(
         line.removeprefix("$ comvla-sim ")
         for block in markdown.blocks(GUIDE, "console")
         for line in block.code.splitlines()
-        if line.startswith("$ comvla-sim") and "centre" in line
+        if line.startswith("$ comvla-sim eval") and "centre" in line
     )
     short = ["--model", "random", "--instructions", "drawer-open", "--workers", "1", "--json"]
     arguments = [*shlex.split(command), "--episodes", "1", *short]

@@ -157,7 +157,9 @@ def test_an_episode_starts_again_when_its_server_left_a_query_unanswered(
     with BackgroundServer(Engine(cloud)) as server:
         cloud.predict = failing_at_first  # type: ignore[method-assign]
         remote = (*options, "--target", server.target)
-        assert evaluate(tmp_path / "remote.jsonl", *remote) == (2 if failures == worker.MOST_TRIES else 0)
+        assert evaluate(tmp_path / "remote.jsonl", *remote) == (
+            2 if failures == worker.MOST_TRIES else 0
+        )
         told = capsys.readouterr().err
         assert told.count("the episode starts again") == min(failures, worker.MOST_TRIES - 1)
         assert "RuntimeError" in told

@@ -36,6 +36,18 @@ FEW = {
     "table2": (),
 }
 
+BACKWARDS = """\
+import numpy as np
+
+
+class LastFirst:
+    uses_language = False
+    sends_all = False
+
+    def rank(self, context):
+        return np.arange(len(context.tokens), dtype=np.int32)[::-1]
+"""
+
 
 @pytest.fixture(autouse=True)
 def little_to_measure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,12 +153,19 @@ def test_number_formats_share_what_is_measured_and_show_their_error(
 
 @pytest.mark.slow
 def test_what_a_query_costs_is_measured_by_every_method(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert paper(tmp_path, "table1") == 0
+    """Somebody's own selector stands beside those of the table."""
+    monkeypatch.setattr(cells, "BUDGETS", (16,))
+    (tmp_path / "backwards.py").write_text(BACKWARDS)
+    monkeypatch.syspath_prepend(tmp_path)
+    own = "backwards:LastFirst"
+    assert paper(tmp_path, "table1", "--also", own) == 0
     printed = json.loads(capsys.readouterr().out)
     timed = {(row["method"], row["k"]) for row in printed["latency"]["rows"]}
-    assert timed == {("full", None), ("hard_voting", 32), ("random", 32)}
+    assert timed == {("full", None), ("hard_voting", 32), ("random", 32), (own, 16)}
+    success = next(t for t in printed["tables"] if t["title"] == "Success")
+    assert [row[7] for row in success["rows"] if row[0] == own] == ["8"]
     assert all(row["edge_ms"] > 0 < row["cloud_ms"] for row in printed["latency"]["rows"])
     assert printed["pictures"]["side"] == 224
     assert printed["pictures"]["kib"]["jpeg-95"] > 1
@@ -184,6 +203,8 @@ def exit_code(arguments: list[str]) -> Any:
         (("table5",), "invalid choice"),
         (("table1", "--world", "libero"), "--model PATH"),
         (("fig4", "--world", "libero", "--model", "x"), "comvla-sim figure fading --world"),
+        (("table1", "--also", "nobody"), "got 'nobody'"),
+        (("table4", "--also", "random"), "--also adds lines to Table I"),
         (("table1", "--episodes", "0"), "--episodes must be at least 1"),
         (
             ("table1", "--world", "libero", "--model", "x", "--suites", "y"),

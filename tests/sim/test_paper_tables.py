@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from comvla_client import registry
 from comvla_sim.experiments.methods import find_method
 from comvla_sim.paper import analytic
 from comvla_sim.paper.cells import GROUPS, PAPER_CELLS, TABLE1_GROUPS, Cell, ordered
@@ -15,6 +16,13 @@ def test_every_line_of_table_1_has_a_cell_that_is_measured() -> None:
     measured = {cell for group in TABLE1_GROUPS for cell in group}
     assert set(PAPER_CELLS) <= measured
     assert set(PAPER_CELLS.values()) == set(TABLE1)
+
+
+def test_every_selector_that_takes_a_number_of_tokens_has_a_cell_at_every_k_of_the_table() -> None:
+    measured = {cell for group in TABLE1_GROUPS for cell in group}
+    for name in set(registry.SELECTORS) - {"hard_voting_random_ties"}:  # a control of its own page
+        if not find_method(name).decides_itself:
+            assert {Cell(name, k) for k in (128, 64, 48, 32, 16, 8)} <= measured, name
 
 
 def test_every_cell_names_a_method_that_exists() -> None:

@@ -79,6 +79,8 @@ TABLE1_GROUPS: tuple[tuple[Cell, ...], ...] = (
     (Cell("soft_voting", 16), Cell("soft_voting", 8)),
     (*(Cell(m, 32) for m in VOTES), Cell("token_norm", 32)),
     tuple(Cell(m, 4) for m in ("hard_voting", "random", "soft_voting", *VOTES)),
+    tuple(Cell("token_norm", k) for k in (16, 8)),
+    *(tuple(Cell(m, k) for m in ("soft_voting", *VOTES, "token_norm")) for k in (48, 64, 128)),
 )
 """All lines of Table I, what matters most first; the cells of a group advance together, layout by layout."""
 
@@ -98,13 +100,31 @@ GROUPS: Mapping[str, tuple[tuple[Cell, ...], ...]] = {
 """What each table needs, in the order in which it is measured."""
 
 
-def ordered(tables: tuple[str, ...]) -> list[tuple[Cell, ...]]:
-    """Groups of cells of several tables, each cell once; the tables' first groups come first."""
+def of_method(name: str) -> tuple[Cell, ...]:
+    """A method at every K, or once where it decides itself what it sends.
+
+    Raises:
+        UnknownMethodError: there is none of that name.
+    """
+    if find_method(name).decides_itself:
+        return (Cell(name),)
+    return tuple(Cell(name, k) for k in BUDGETS)
+
+
+def ordered(
+    tables: tuple[str, ...], also: tuple[tuple[Cell, ...], ...] = ()
+) -> list[tuple[Cell, ...]]:
+    """Groups of cells of several tables, each cell once; the tables' first groups come first.
+
+    Args:
+        tables: their names.
+        also: groups of cells that no table has, measured last.
+    """
     seen: set[Cell] = set()
     found = []
     first = [GROUPS[name][:2] for name in tables]
     rest = [GROUPS[name][2:] for name in tables]
-    for group in itertools.chain(*first, *rest):
+    for group in itertools.chain(*first, *rest, also):
         new = tuple(cell for cell in group if cell not in seen)
         seen.update(new)
         if new:

@@ -38,6 +38,7 @@ EPILOG = """\
 examples:
   comvla-sim paper all --quick
   comvla-sim paper table1 --episodes 20 --json
+  comvla-sim paper table1 --also centre:CentreFirst
   comvla-sim paper table1 --ray head-node:6379
   comvla-sim paper all --docs docs
   comvla-sim paper all --world libero --model ./oft-{suite}
@@ -63,6 +64,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--episodes", type=whole(), default=20, help="tables per instruction and method (20)"
+    )
+    parser.add_argument(
+        "--also",
+        type=listed(str),
+        default=(),
+        metavar="METHOD",
+        help="further methods for Table I, e.g. my_module:MySelector; as for comvla-sim eval",
     )
     parser.add_argument("--world", choices=("tabletop", "libero"), default="tabletop")
     parser.add_argument(
@@ -116,7 +124,12 @@ def run(args: argparse.Namespace) -> int:
         only=args.suites,
         reuse=tuple(args.reuse) if args.reuse else gathering.default_reuse(),
         measured_only=args.measured_only,
+        also=args.also,
     )
+    if args.also and args.part not in ("table1", "all"):
+        raise EvaluationError(
+            f"--also adds lines to Table I, not to {args.part}: ask for table1 or all"
+        )
     wanted = [part for part in PARTS if part != "all"] if args.part == "all" else [args.part]
     if args.world == "libero":
         wanted = _on_libero(wanted, everything=args.part == "all")

@@ -48,11 +48,12 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
     tables = tuple(part for part in parts if part in TABLES)
     settings: Json = study.subject.settings
     if any(GROUPS[name] for name in tables):
-        measured, settings = measure_cells(plan, ordered(tables))
+        also = plan.more_cells() if "table1" in tables else ()
+        measured, settings = measure_cells(plan, ordered(tables, also))
         data["cells"], data["pairs"] = all_counts(measured), all_pairs(measured)
     inside = plan.target is None
     if inside and {"table1", "table2"} & set(tables):
-        data |= _kept_or(plan, "latency", lambda: _latency(study))
+        data |= _kept_or(plan, "latency", lambda: _latency(plan, study))
     if inside and "table1" in tables and plan.world != "libero":
         data |= _kept_or(plan, "pictures", lambda: _pictures(plan, study, data))
     if inside and "table4" in tables:
@@ -79,10 +80,11 @@ def _kept_or(plan: Plan, name: str, make: Callable[[], Json]) -> Json:
     return {name: made}
 
 
-def _latency(study: Study) -> Json:
+def _latency(plan: Plan, study: Study) -> Json:
     from comvla_sim.paper.latency import measure_latency
 
-    cells = [*PAPER_CELLS, *(cell for group in GROUPS["table1"] for cell in group)]
+    groups = (*GROUPS["table1"], *plan.more_cells())
+    cells = [*PAPER_CELLS, *(cell for group in groups for cell in group)]
     return measure_latency(study, list(dict.fromkeys(cells)))
 
 

@@ -17,7 +17,7 @@ from comvla_sim.experiments.plan import EvalSettings, chosen_tasks
 from comvla_sim.experiments.results import Row
 from comvla_sim.experiments.statistics import mcnemar, wilson_interval
 from comvla_sim.figures.measuring import Study, kept, measure
-from comvla_sim.paper.cells import Cell
+from comvla_sim.paper.cells import Cell, of_method
 from comvla_sim.paper.published import SUITES
 
 
@@ -38,6 +38,7 @@ class Plan:
         only: suites of LIBERO to run; empty for all.
         reuse: folders of other runs, whose episodes are taken over.
         measured_only: measure nothing, and report what is there.
+        also: further methods, as ``comvla-sim eval --method`` takes them, for Table I.
     """
 
     world: str = "tabletop"
@@ -51,6 +52,15 @@ class Plan:
     only: tuple[str, ...] = ()
     reuse: tuple[Path, ...] = ()
     measured_only: bool = False
+    also: tuple[str, ...] = ()
+
+    def more_cells(self) -> tuple[tuple[Cell, ...], ...]:
+        """What ``also`` adds to Table I, a group for each method.
+
+        Raises:
+            UnknownMethodError: there is none of that name.
+        """
+        return tuple(of_method(name) for name in self.also)
 
     def suites(self) -> tuple[str, ...]:
         """Names of the columns: LIBERO's four suites, or the one world."""
