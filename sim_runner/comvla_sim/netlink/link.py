@@ -21,6 +21,9 @@ from comvla_sim.netlink.namespaces import LinkName
 from comvla_sim.netlink.shaper import Shaper
 from comvla_sim.netlink.wires import Side
 
+ANSWER_TIMEOUT_S = 30.0
+"""Longest that the process which follows the channel may be silent."""
+
 _ROBOT_PORT, _CLOUD_PORT = "robot-port", "cloud-port"
 
 
@@ -148,20 +151,23 @@ class NamespaceLink:
         """How well the process that follows the channel kept time so far.
 
         Raises:
-            LinkError: that process has ended, e.g. because its device vanished.
+            LinkError: that process has ended, e.g. because its device vanished, or does not answer.
         """
         assert self._driver is not None, "only a link that follows a channel has a driver"
         try:
             self._driver.send_bytes(b"?")
-            if self._driver.poll(10.0):
-                answer = json.loads(self._driver.recv_bytes())
-                return Punctuality(answer["late"], answer["stolen_periods"])
-        except (OSError, EOFError):
-            pass
-        raise LinkError(
-            "the process that follows the channel has ended (its message is above): was the link "
-            "taken down meanwhile?"
-        )
+            if not self._driver.poll(ANSWER_TIMEOUT_S):
+                raise LinkError(
+                    "the process that follows the channel did not answer within "
+                    f"{ANSWER_TIMEOUT_S:.0f} s: was this machine suspended, or is it too busy?"
+                )
+            answer = json.loads(self._driver.recv_bytes())
+        except (OSError, EOFError) as error:
+            raise LinkError(
+                "the process that follows the channel has ended (its message is above): was the "
+                "link taken down meanwhile?"
+            ) from error
+        return Punctuality(answer["late"], answer["stolen_periods"])
 
     def set_up_down(self, up: bool, *, at: Literal["robot", "cloud"] = "cloud") -> None:
         """Cuts the link or restores it.
