@@ -97,6 +97,11 @@ def _add_options(parser: argparse.ArgumentParser, *, one: bool) -> None:
             "--episodes", type=whole(), default=20, help="tables per instruction (20)"
         )
         parser.add_argument("--quick", action="store_true", help="fewer points, 2 tables: minutes")
+        parser.add_argument(
+            "--measured-only",
+            action="store_true",
+            help="measure nothing; draw what is there, and leave out what is not",
+        )
         parser.add_argument("--workers", type=whole(), default=0, help="processes (one per core)")
         parser.add_argument("--ray", metavar="ADDRESS", help="as for comvla-sim eval")
     parser.add_argument("--out", type=Path, default=Path("runs/figure"), help="(runs/figure)")
@@ -144,7 +149,8 @@ def _sweep(args: argparse.Namespace, study: Study) -> dict[str, Any]:
 
     sweep = SWEEPS[args.figure]
     series = chosen(sweep.series if args.series is None else args.series)
-    printed, text = run_sweep(args.figure, study, series, _links(args, study, sweep))
+    links = _links(args, study, sweep)
+    printed, text = run_sweep(args.figure, study, series, links, measured_only=args.measured_only)
     if not args.json:
         print(text)
         print("\n".join(printed["files"]))
