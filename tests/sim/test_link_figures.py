@@ -275,7 +275,7 @@ def test_tables_have_lines_down_and_what_was_varied_across() -> None:
         if spec.link is not None:
             row["link_use"] = made_up_link_use((0.5, 2.0))
     success, above, answered, time = tables("fading", points(rows, series, links))
-    assert success.title == "Success, rayleigh, reports 1 periods old"
+    assert success.title == "Success, rayleigh, reports 1 period old"
     assert success.header == ("line", "0 dB", "10 dB")
     assert [row[0] for row in success.rows] == [line.label for line in series.values()]
     assert success.rows[0][1:] == ("75.0 (30.1–95.4)",) * 2

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from comvla_sim.experiments.statistics import mcnemar, wilson_interval
+from comvla_sim.experiments.statistics import mcnemar, p_text, wilson_interval
 
 
 # Newcombe (1998), Statistics in Medicine 17, table I: Wilson's score method without correction.
@@ -65,7 +65,10 @@ def test_mcnemar_is_the_share_of_sign_patterns_at_least_as_uneven(
 
 
 def test_mcnemar_of_many_pairs_does_not_overflow() -> None:
-    assert mcnemar([True] * 3000, [False] * 3000).p_value == 0.0
+    p_value = mcnemar([True] * 3000, [False] * 3000).p_value
+    assert p_value == 0.0
+    assert p_text(p_value) == "< 1e-300"
+    assert p_text(0.04321, 1) == "0.04"
     half = [True, False] * 2000
     assert mcnemar(half, half[::-1]).p_value == 1.0
 

@@ -74,3 +74,8 @@ def mcnemar(first: Sequence[bool], second: Sequence[bool]) -> McNemar:
     # Integers until the division: 2 ** discordant overflows a float from 1024 pairs on.
     p_value = min(1.0, 2 * tail / 2**discordant)
     return McNemar(len(first), only_first, only_second, p_value)
+
+
+def p_text(p_value: float, digits: int = 2) -> str:
+    """A p-value for a table; one that a float cannot hold is said to be small, not zero."""
+    return f"{p_value:.{digits}g}" if p_value >= 1e-300 else "< 1e-300"

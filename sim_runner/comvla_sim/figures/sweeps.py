@@ -140,7 +140,9 @@ def caption(points: Sequence[Point], study: Study, link: LinkCase) -> str:
         "every byte on the wire counts where the link is enforced.",
     ]
     if len(delays) == 1:
-        parts.append(f"The reported SNR is {delays[0]} periods old.")
+        parts.append(
+            f"The reported SNR is {delays[0]} {'period' if delays[0] == 1 else 'periods'} old."
+        )
     if "progressive+floor" in names or "floor" in names:
         parts.append(f"Floor: {USEFUL_TOKENS} tokens.")
     if any(SERIES[name].method == "random" for name in names):

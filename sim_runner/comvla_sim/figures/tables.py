@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from comvla_sim.experiments.statistics import p_text
 from comvla_sim.figures.points import Point
 from comvla_sim.figures.series import SERIES
 from comvla_sim.figures.sweeps import overruns, sized_by_report
@@ -49,7 +50,7 @@ def comparison_table(tests: Sequence[Mapping[str, Any]]) -> Table:
                 str(test["pairs"]),
                 str(test["only_first"]),
                 str(test["only_second"]),
-                f"{test['p_value']:.2g}",
+                p_text(test["p_value"]),
             )
             for test in tests
             if test["link"] is None
@@ -60,7 +61,8 @@ def comparison_table(tests: Sequence[Mapping[str, Any]]) -> Table:
 def _where(fixed: Mapping[str, Any]) -> str:
     if "mean_snr_db" in fixed:
         return f"{fixed['channel']}, mean {fixed['mean_snr_db']:g} dB"
-    return f"{fixed['channel']}, reports {fixed['csi_delay']} periods old"
+    delay = fixed["csi_delay"]
+    return f"{fixed['channel']}, reports {delay} {'period' if delay == 1 else 'periods'} old"
 
 
 def _head(across: str, value: Any) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from comvla_sim.experiments.methods import order, shown_k
+from comvla_sim.experiments.statistics import p_text
 from comvla_sim.paper.cells import BUDGETS, PAPER_CELLS, Cell
 from comvla_sim.paper.changes import (
     ALL_EPISODES,
@@ -184,7 +185,7 @@ def _against_random(results: Results) -> Table:
                 str(test["pairs"]),
                 str(test["only_first"]),
                 str(test["only_second"]),
-                f"{test['p_value']:.1g}",
+                p_text(test["p_value"], 1),
                 verdict.text,
             )
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from comvla_sim.experiments.statistics import p_text
 from comvla_sim.paper import analytic
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.changes import (
@@ -111,7 +112,7 @@ def table3(results: Results) -> list[Table]:
                 gap_text(ours),
                 str(test["pairs"]),
                 f"{test['only_second']} : {test['only_first']}",
-                f"{test['p_value']:.1g}",
+                p_text(test["p_value"], 1),
                 verdict.text,
             )
         )
@@ -179,7 +180,7 @@ def table4(results: Results) -> list[Table]:
                 DASH if moved is None else change_text(moved),
                 _format_verdict(results, cell, reference, ours),
                 DASH if ours is None else str(ours.episodes),
-                DASH if test is None else f"{test['p_value']:.1g}",
+                DASH if test is None else p_text(test["p_value"], 1),
                 DASH if found is None else f"{found['wire_bytes'] / analytic.KIB:.2f}",
             )
         )

@@ -8,6 +8,7 @@ from html import escape
 from typing import Any
 
 from comvla_sim.experiments.methods import shown_k
+from comvla_sim.experiments.statistics import p_text
 from comvla_sim.report.terminal import entry_name, method_name, percent
 
 _OWN = "its own size"
@@ -190,7 +191,7 @@ def _comparisons(lines: Sequence[dict[str, Any]]) -> Table:
                 str(line["pairs"]),
                 str(line["only_first"]),
                 str(line["only_second"]),
-                f"{line['p_value']:.2g}",
+                p_text(line["p_value"]),
             )
             for line in lines
         ),

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.methods import shown_k
+from comvla_sim.experiments.statistics import p_text
 
 _MAX_COMPARISONS = 12
 
@@ -124,7 +125,7 @@ def _print_comparisons(lines: Sequence[Line], console: Console) -> None:
     for line in sorted(between, key=lambda line: float(line["p_value"]))[:_MAX_COMPARISONS]:
         names = (entry_name(line["first"]), entry_name(line["second"]))
         counts = (str(line[key]) for key in ("pairs", "only_first", "only_second"))
-        table.add_row(*names, *counts, f"{line['p_value']:.2g}")
+        table.add_row(*names, *counts, p_text(line["p_value"]))
     console.print("Paired episodes, exact McNemar test", style="bold")
     console.print(table)
     hidden = len(lines) - min(len(between), _MAX_COMPARISONS)
