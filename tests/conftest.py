@@ -6,6 +6,11 @@ import logging
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
+
+# How long an example takes is the machine's affair, and says nothing about the code.
+settings.register_profile("comvla", deadline=None)
+settings.load_profile("comvla")
 
 
 @pytest.fixture(autouse=True)
