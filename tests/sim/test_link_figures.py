@@ -259,7 +259,10 @@ def test_points_and_pairs_are_what_one_counts_by_hand() -> None:
     assert found[3].bytes_per_query == 500
     test = pairs(rows, series["drop"], series["prefix"], links)
     assert (test["pairs"], test["only_first"], test["only_second"]) == (20, 0, 4)
-    assert test["p_value"] == pytest.approx(2 / 2**4)
+    # Two layouts differ, on both tasks each: repetitions of one layout are no further evidence.
+    assert (test["layouts"], test["p_value"]) == (5, 2 / 2**2)
+    alone = pairs(rows, series["drop"], series["prefix"], links[:1])
+    assert (alone["pairs"], alone["only_second"], alone["p_value"]) == (10, 2, 2 / 2**2)
 
 
 def test_tables_have_lines_down_and_what_was_varied_across() -> None:

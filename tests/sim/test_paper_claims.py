@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from paper_stubs import results, rows
 
-from comvla_sim.paper import analytic, cost_claims, success_claims
+from comvla_sim.paper import analytic, cost_claims, link_claims, success_claims
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.verdicts import AGREES, DIFFERS, UNTESTED, Kind
 
@@ -116,3 +116,63 @@ def test_an_interval_that_holds_the_papers_lead_and_none_is_said_to_show_none(
     claim = success_claims.against_soft(made)
     assert claim is not None
     assert ("which shows no lead" in claim[1]) != leads
+    assert (claim[2].kind == UNTESTED) != leads
+
+
+def swept(**lines: dict[float, int]) -> list[dict[str, Any]]:
+    """Points of a sweep: successes of 100 by what is on its axis."""
+    return [
+        {
+            "series": name,
+            "axes": {"channel": "rician", "mean_snr_db": at, "csi_delay": at},
+            "successes": successes,
+            "episodes": 100,
+            "answered": 0.5,
+        }
+        for name, points in lines.items()
+        for at, successes in points.items()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "kind", "detail"),
+    [
+        (99, AGREES, "as simulated"),
+        (97, AGREES, "but the interval allows more"),
+        (80, DIFFERS, "by -19.0 points"),
+    ],
+)
+def test_stale_reports_are_compared_with_fresh_ones_of_the_same_link(
+    old: int, kind: Kind, detail: str
+) -> None:
+    made = results({("tabletop", Cell("full")): rows(Cell("full"), 1, 1)})
+    ages = {1: old, 2: old, 3: old, 4: old}
+    lines = swept(unenforced={0: 99, **ages}, drop={0: 90, 1: 80, 2: 80, 3: 80, 4: 80})
+    made.data["csi-delay"] = {"points": lines}
+    claim = link_claims.stale(made)
+    assert claim is not None
+    assert "late payloads are lost -10.0 points" in claim[1], "enforced against enforced"
+    assert (claim[2].kind, detail in claim[2].detail) == (kind, True)
+
+
+def test_four_ages_of_the_same_layouts_are_no_more_evidence_than_one() -> None:
+    made = results({("tabletop", Cell("full")): rows(Cell("full"), 1, 1)})
+    said = []
+    for ages in ({1: 90}, {1: 90, 2: 90, 3: 90, 4: 90}):
+        made.data["csi-delay"] = {"points": swept(unenforced={0: 99, **ages})}
+        claim = link_claims.stale(made)
+        assert claim is not None
+        said.append(claim[1])
+    assert said[0] == said[1]
+
+
+@pytest.mark.parametrize(("random", "kind"), [(20, AGREES), (96, DIFFERS)])
+def test_under_fading_votes_must_be_ahead_of_random_tokens(random: int, kind: Kind) -> None:
+    made = results({("tabletop", Cell("full")): rows(Cell("full"), 1, 1)})
+    lines = swept(unenforced={0: 80, 5: 97, 20: 99}, random={0: 10, 5: random, 20: 25})
+    made.data["fading"] = {"points": lines}
+    claim = link_claims.fading(made)
+    assert claim is not None
+    assert claim[2].kind == kind
+    if kind == AGREES:
+        assert "votes lose 19 points, and random tokens 15" in claim[1]

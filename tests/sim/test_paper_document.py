@@ -97,8 +97,8 @@ def test_methods_are_compared_on_the_tables_that_both_were_run_on() -> None:
     int8 = line(table4(made)[0], "int8")
     assert int8["change"] == "0.0"
     assert int8["here, %"].startswith("95.0")
-    assert "the same tables as far as both were run" in markdown(made)
-    assert "the same tables for every method." in markdown(results(a_few_cells()))
+    assert "the same layouts as far as both were run" in markdown(made)
+    assert "the same layouts for every method." in markdown(results(a_few_cells()))
 
 
 def test_as_many_episodes_on_other_tables_are_not_compared() -> None:
@@ -161,6 +161,17 @@ def test_on_the_papers_own_benchmark_rates_are_compared_suite_by_suite() -> None
     assert full["verdict"].startswith("agrees")
     assert full["episodes"] == "40"
     assert line(tables[0], "full")["episodes"] == "160"
+
+
+def test_a_part_of_the_benchmark_is_not_compared_with_the_papers_average_over_all_of_it() -> None:
+    cells = (Cell("full"), Cell("random", 32))
+    suites = ("libero_spatial", "libero_10")
+    measured = {(s, cell): rows(cell, 15, 20, s) for s in suites for cell in cells}
+    whole, *by_suite = table1(results(measured, world="libero"))
+    assert "not all of them were run" in line(whole, "random", "32")["verdict"]
+    assert len(by_suite) > len(suites)
+    for table in by_suite[: len(suites)]:
+        assert "not all of them" not in line(table, "random", "32")["verdict"]
 
 
 def test_stand_in_pictures_are_compared_with_nothing() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from comvla_sim.experiments.statistics import mcnemar, p_text, wilson_interval
+from comvla_sim.experiments.statistics import mcnemar, p_text, sign_flip, wilson_interval
 
 
 # Newcombe (1998), Statistics in Medicine 17, table I: Wilson's score method without correction.
@@ -76,3 +76,17 @@ def test_mcnemar_of_many_pairs_does_not_overflow() -> None:
 def test_mcnemar_needs_pairs() -> None:
     with pytest.raises(ValueError, match="pairs"):
         mcnemar([True], [])
+
+
+@given(differences=st.lists(st.integers(-5, 5), max_size=8))
+def test_sign_flips_are_counted_as_if_written_out(differences: list[int]) -> None:
+    sums = [
+        sum(sign * d for sign, d in zip(signs, differences, strict=True))
+        for signs in itertools.product((-1, 1), repeat=len(differences))
+    ]
+    extreme = sum(abs(value) >= abs(sum(differences)) for value in sums)
+    assert sign_flip(differences) == pytest.approx(extreme / len(sums))
+
+
+def test_a_group_counts_once_however_many_episodes_it_has() -> None:
+    assert sign_flip([40] * 5) == sign_flip([1] * 5) == 2 / 2**5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -74,6 +75,27 @@ def mcnemar(first: Sequence[bool], second: Sequence[bool]) -> McNemar:
     # Integers until the division: 2 ** discordant overflows a float from 1024 pairs on.
     p_value = min(1.0, 2 * tail / 2**discordant)
     return McNemar(len(first), only_first, only_second, p_value)
+
+
+def sign_flip(differences: Sequence[int]) -> float:
+    """Two-sided p of no difference, where outcomes within a group depend on each other.
+
+    Under the null hypothesis a group's difference is as likely as its opposite. All patterns of signs are counted, by
+    their sums.
+
+    Args:
+        differences: of each group: successes of one method less those of another.
+    """
+    sums = {0: 1}
+    for difference in differences:
+        counts: dict[int, int] = defaultdict(int)
+        for value, count in sums.items():
+            counts[value + difference] += count
+            counts[value - difference] += count
+        sums = counts
+    observed = abs(sum(differences))
+    extreme = sum(count for value, count in sums.items() if abs(value) >= observed)
+    return float(extreme / (1 << len(differences)))
 
 
 def p_text(p_value: float, digits: int = 2) -> str:

@@ -50,7 +50,7 @@ QUICK_SNR_DB, QUICK_DELAYS = (0.0, 10.0, 20.0), (0, 2)
 
 BANDWIDTH_HZ, TOKEN_DIM = 0.18e6, 96
 """One LTE resource block, the carrier of NB-IoT, and the shipped policy's tokens: from 0 to 20 dB
-K* goes from 3 to 25, across the policy's knee between 4 and 16."""
+K* by Eq. (4) goes from 3 to 26 on average, across the policy's knee between 4 and 16."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.plan import EpisodeSpec
 from comvla_sim.experiments.results import Row
-from comvla_sim.experiments.statistics import mcnemar, wilson_interval
+from comvla_sim.experiments.statistics import mcnemar, sign_flip, wilson_interval
 from comvla_sim.experiments.summary import link_use
 from comvla_sim.figures.series import Series
 
@@ -103,7 +103,10 @@ def pairs(
     second: Series,
     links: Sequence[LinkCase],
 ) -> dict[str, Any]:
-    """Exact McNemar test of two lines on the same tables, instructions and fading.
+    """Two lines compared on the same layouts, instructions and fading.
+
+    Over one link by McNemar's exact test. Over several, a layout's episodes are repetitions of each other, so each
+    layout counts once (:func:`comvla_sim.experiments.statistics.sign_flip`).
 
     Args:
         rows: of every episode.
@@ -112,16 +115,20 @@ def pairs(
         links: over which both are compared, put together.
     """
     outcomes: list[tuple[bool, bool]] = []
+    layouts: dict[int, int] = defaultdict(int)
     for link in links:
         theirs = {
             (spec.task, spec.episode): bool(row["success"])
             for spec, row in rows.items()
             if (spec.method, spec.link) == (second.method, second.link(link))
         }
-        outcomes += [
-            (bool(row["success"]), theirs[spec.task, spec.episode])
-            for spec, row in rows.items()
-            if (spec.method, spec.link) == (first.method, first.link(link))
-            and (spec.task, spec.episode) in theirs
-        ]
-    return vars(mcnemar([a for a, _ in outcomes], [b for _, b in outcomes]))
+        for spec, row in rows.items():
+            other = theirs.get((spec.task, spec.episode))
+            if (spec.method, spec.link) != (first.method, first.link(link)) or other is None:
+                continue
+            outcomes.append((bool(row["success"]), other))
+            layouts[spec.episode] += bool(row["success"]) - other
+    test = vars(mcnemar([a for a, _ in outcomes], [b for _, b in outcomes]))
+    if len(links) > 1:
+        test["p_value"] = sign_flip(list(layouts.values()))
+    return {**test, "layouts": len(layouts)}

@@ -40,14 +40,15 @@ def comparison_table(tests: Sequence[Mapping[str, Any]]) -> Table:
     """Paired tests of lines over all links of a figure together."""
     return Table(
         "Paired tests",
-        "Exact McNemar tests over all links together, on the same tables, instructions and fading; p "
-        "is two-sided and not corrected for the number of tests.",
-        ("first", "second", "pairs", "only first", "only second", "p"),
+        "All links together, on the same layouts, instructions and fading. A layout's episodes depend on each other, "
+        "so p is of an exact sign-flip test over layouts; two-sided, not corrected for the number of tests.",
+        ("first", "second", "pairs", "layouts", "only first", "only second", "p"),
         tuple(
             (
                 SERIES[test["first"]].label,
                 SERIES[test["second"]].label,
                 str(test["pairs"]),
+                str(test["layouts"]),
                 str(test["only_first"]),
                 str(test["only_second"]),
                 p_text(test["p_value"]),

@@ -5,9 +5,12 @@ from __future__ import annotations
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.published import EPISODES_PER_SUITE, SUITES
 from comvla_sim.paper.results import Results
-from comvla_sim.paper.verdicts import UNTESTED, Rate, Verdict, compare_changes, contrast
+from comvla_sim.paper.verdicts import AGREES, UNTESTED, Rate, Verdict, compare_changes, contrast
 
 STAND_IN = Verdict(UNTESTED, "drawn with stand-in assets")
+SOME_SUITES = Verdict(
+    UNTESTED, "the paper's average is over four suites, and not all of them were run"
+)
 NOTHING_SHARED = Verdict(UNTESTED, "no table was run with both yet")
 
 ALL_EPISODES = EPISODES_PER_SUITE * len(SUITES)
@@ -52,6 +55,26 @@ def change_verdict(
         return NOTHING_SHARED
     if results.stand_in:
         return STAND_IN
+    if suite is None and results.some_suites:
+        return SOME_SUITES
     episodes = EPISODES_PER_SUITE if suite in SUITES else ALL_EPISODES
     first, second = (Rate.of_percent(percent, episodes) for percent in printed)
     return compare_changes((first, second), ours)
+
+
+def lead_verdict(
+    results: Results, cells: tuple[Cell, Cell], printed: tuple[float, float]
+) -> Verdict:
+    """As :func:`change_verdict`, for a claim that the first is ahead: no lead found is no agreement.
+
+    Args:
+        results: what was measured.
+        cells: the first is said to be ahead of the second.
+        printed: what the paper prints for them, percent.
+    """
+    verdict, ours = change_verdict(results, cells, printed), results.shared(*cells)
+    if ours is None or verdict.kind != AGREES or contrast([(1, ours[0]), (-1, ours[1])])[1] > 0:
+        return verdict
+    return Verdict(
+        UNTESTED, f"{ours[0].episodes} episodes show neither that lead nor that there is none"
+    )

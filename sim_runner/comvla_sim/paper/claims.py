@@ -14,7 +14,8 @@ def table(results: Results) -> Table:
         "The paper's claims",
         "In its words or close to them, with what came out here. “Agrees” is about this world and this policy: it "
         "says that "
-        "the mechanism works here, not that the paper's numbers were reproduced.",
+        "the mechanism works here and that no difference from the paper could be shown, not that its numbers were "
+        "reproduced.",
         ("claim", "here", "verdict"),
         tuple((claim, here, verdict.text) for claim, here, verdict in claims(results)),
     )

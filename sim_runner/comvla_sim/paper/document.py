@@ -7,7 +7,7 @@ from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.changes import change
 from comvla_sim.paper.figure_parts import figure3, sweeps
 from comvla_sim.paper.part import PICTURES, Part
-from comvla_sim.paper.published import TABLE1
+from comvla_sim.paper.published import PAPER, TABLE1
 from comvla_sim.paper.results import Results
 from comvla_sim.paper.table1 import counted_verdicts
 from comvla_sim.paper.table1 import tables as table1
@@ -58,7 +58,7 @@ def markdown(results: Results) -> str:
     """docs/results.md."""
     head = (
         f"# {TITLE}\n\nWritten by `comvla-sim paper all`; not to be edited by hand. Columns headed *paper* are quoted "
-        "from the paper, everything else was measured or calculated by the command in this repository.\n"
+        f"from the paper ({PAPER}), everything else was measured or calculated by the command in this repository.\n"
     )
     return "\n".join([head, *(_markdown(part) for part in parts(results))])
 
@@ -90,14 +90,13 @@ def _story(results: Results) -> Part:
     words = [
         f"- {episodes} episodes of {len(results.cells)} ways of sending in {world}, {len(story['tasks'])} "
         "instructions, "
-        f"{story['episodes']} tables wanted for each instruction and method, evaluation seed {story['seed']}, "
+        f"{story['episodes']} layouts of the table wanted for each instruction and method, evaluation seed "
+        f"{story['seed']}, "
         f"{_same_tables(results)} Training never saw them. One evaluation seed and one training seed: intervals cover "
-        "the "
-        "tables, not the training.",
+        "the layouts, not the training, and take the instructions of one layout as independent.",
         f"- Policy {settings['model']}, fingerprint `{settings['model_fingerprint']}`; INT8 tokens unless a line says "
         "otherwise; a link that loses nothing in the tables, fading in Figs. 4 and 5.",
-        f"- {wall_h:.1f} hours of wall time in episodes on {machine['cpu']} ({machine['cores']} cores, shared with "
-        "other work and halted at times); "
+        f"- {wall_h:.1f} hours of wall time in episodes on {machine['cpu']} ({machine['cores']} cores); "
         "Python "
         f"{machine['python']}, "
         + ", ".join(f"{name} {number}" for name, number in versions.items())
@@ -112,6 +111,9 @@ def _story(results: Results) -> Part:
         for cell in results.cells
         if (found := results.find(cell)) and found["episodes"] < _complete(results)
     ]
+    missing = results.data.get("missing", [])
+    if missing:
+        words.append(f"- **Not measured yet**: {', '.join(missing)}.")
     if short:
         listed = ", ".join(f"{cell.name} ({count})" for cell, count in short)
         words.append(
@@ -124,9 +126,9 @@ def _story(results: Results) -> Part:
 
 def _same_tables(results: Results) -> str:
     if results.same_tables:
-        return "the same tables for every method."
+        return "the same layouts for every method."
     return (
-        "the same tables as far as both were run, and differences between two methods are taken on the tables that "
+        "the same layouts as far as both were run, and differences between two methods are taken on those that "
         "both have."
     )
 
@@ -137,15 +139,10 @@ def _complete(results: Results) -> int:
 
 
 def _in_short(results: Results) -> list[str]:
-    shown = [table for part in _tables(results) for table in part]
-    texts = list(counted_verdicts(shown))
-    counts = {
-        kind: sum(text.startswith(kind) for text in texts)
-        for kind in (AGREES, DIFFERS, UNTESTED, OURS)
-    }
+    measured, calculated = (_counts(part) for part in _tables(results))
     words = [
-        f"Of the cells that the tables below hold, {counts[AGREES]} agree with the paper, {counts[DIFFERS]} differ, "
-        f"{counts[UNTESTED]} cannot be tested here, and {counts[OURS]} are not in the paper.",
+        f"Of the cells below on success, which were measured, {measured}. Of those on bytes, operations and latency, "
+        f"most of which are calculated at the paper's sizes, {calculated}.",
     ]
     if not results.libero:
         words += [
@@ -163,23 +160,32 @@ def _in_short(results: Results) -> list[str]:
     return words
 
 
-def _tables(results: Results) -> list[list[Table]]:
-    found = [tables2to4.table2(results)]
-    if results.data["cells"]:
-        found += [
-            table1(results),
-            costs.tables(results),
-            tables2to4.table3(results),
-            tables2to4.table4(results),
-        ]
-    return found
+def _counts(shown: list[Table]) -> str:
+    texts = list(counted_verdicts(shown))
+    agree, differ, untested, ours = (
+        sum(text.startswith(kind) for text in texts) for kind in (AGREES, DIFFERS, UNTESTED, OURS)
+    )
+    return (
+        f"{agree} agree with the paper, {differ} differ, {untested} cannot be tested here, and {ours} are not in the "
+        "paper"
+    )
+
+
+def _tables(results: Results) -> tuple[list[Table], list[Table]]:
+    """Tables on success, and those on what a query costs."""
+    cost = tables2to4.table2(results)
+    if not results.data["cells"]:
+        return [], cost
+    success = [*table1(results), *tables2to4.table3(results), *tables2to4.table4(results)]
+    return success, [*cost, *costs.tables(results)]
 
 
 def _table1_words(results: Results) -> list[str]:
     words = []
     ours = change(results, Cell("random", 32), Cell("full"))
     theirs = TABLE1["random", 32].average - TABLE1["full", None].average
-    if ours is not None and not results.libero and ours < theirs:
+    mini = results.story["settings"]["model"] == "comvla-mini"
+    if ours is not None and mini and ours < theirs:
         words.append(
             "Random tokens fall deeper here than in the paper. This policy never saw them in training, and its tokens "
             "see "
@@ -218,8 +224,8 @@ def _table4_words(results: Results) -> list[str]:
         f"{100 * massive['layers'][1]['error']:.0f} % "
         f"behind the projector and {100 * massive['layers'][-1]['error']:.0f} % behind the last layer: all other "
         "channels "
-        "round to zero. The features that OpenVLA-OFT sends are un-normalised and have such channels; that explains "
-        "the "
+        "round to zero. The features that OpenVLA-OFT sends are un-normalised and have such channels; that would "
+        "explain the "
         "paper's drop, and a scale for each channel would avoid it."
     ]
 

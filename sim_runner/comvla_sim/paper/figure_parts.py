@@ -25,9 +25,8 @@ def figure3(found: Json) -> Part:
     words = [
         "One picture, several instructions. What is bright crosses the link; a ring marks the thing that the words "
         "name. "
-        "The paper shows one instruction of LIBERO; that votes gather on hand, object and goal, and random tokens "
-        "anywhere, "
-        "agrees with it.",
+        "The paper shows one instruction of LIBERO; its votes gather on hand, object and goal, its random "
+        "tokens anywhere; whether these do is to be seen, and counted in the table below.",
     ]
     pictures = [PICTURES["fig3"]]
     film = found["film"]

@@ -49,7 +49,10 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
     settings: Json = study.subject.settings
     if any(GROUPS[name] for name in tables):
         also = plan.more_cells() if "table1" in tables else ()
-        measured, settings = measure_cells(plan, ordered(tables, also))
+        groups = ordered(tables, also)
+        measured, settings = measure_cells(plan, groups)
+        there = {cell for _, cell in measured}
+        data["missing"] = [cell.name for group in groups for cell in group if cell not in there]
         data["cells"], data["pairs"] = all_counts(measured), all_pairs(measured)
     inside = plan.target is None
     if inside and {"table1", "table2"} & set(tables):

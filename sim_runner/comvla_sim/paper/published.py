@@ -7,6 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+PAPER = (
+    "B. Liu, W. Y. Poe, J. Di, R. Trivisonno and G. Caire, “ComVLA: Communication-Aware Split Inference for VLA Models "
+    "in 6G-Connected Robotics”"
+)
+
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 """LIBERO's suites in the order of the paper's columns."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from comvla_sim.paper.cells import BUDGETS, CODEC_SNR_DB, Cell
-from comvla_sim.paper.changes import change_verdict
+from comvla_sim.paper.changes import change_verdict, lead_verdict
 from comvla_sim.paper.claim import NEGLIGIBLE, Claim, ahead, gap, worst
 from comvla_sim.paper.published import TABLE1, TABLE3, TABLE4, TABLE_K
 from comvla_sim.paper.results import Json, Results
@@ -82,7 +82,7 @@ def against_soft(results: Results) -> Claim | None:
         f"{'' if ahead(*rates).kind == AGREES else ', which shows no lead'}; this policy's attention is concentrated "
         "by training"
     )
-    verdict = change_verdict(results, (_HARD, _SOFT), printed)
+    verdict = lead_verdict(results, (_HARD, _SOFT), printed)
     return "Hard votes beat soft votes by 1.7 points", here, verdict
 
 
@@ -115,8 +115,9 @@ def int4_reason(results: Results) -> Claim | None:
     here = (
         "the order does not pass through the number format, because robots vote first; votes on INT4 tokens would "
         "still "
-        f"name {100 * plain['order_overlap']:.0f} % of the same. INT4 spoils values: {_first(plain)} here, "
-        f"{_first(massive)} once one channel is {found['massive']:g} times as large"
+        f"name {100 * plain['order_overlap']:.0f} % of the same here, and "
+        f"{100 * massive['order_overlap']:.0f} % once one channel is {found['massive']:g} times as large. INT4 spoils "
+        f"values: {_first(plain)} here, {_first(massive)} with that channel"
     )
     return "INT4 fails because it corrupts the importance ordering", here, _why(plain, massive)
 
@@ -157,7 +158,7 @@ def codecs(results: Results) -> Claim | None:
     if not found:
         return None
     here = "; ".join(said)
-    here += ", at 10 dB; both are trained here for an hour of a CPU, WITT at a sixtieth of its size (codecs.md)"
+    here += ", at 10 dB; both are trained for less than an hour of a CPU, WITT at a sixtieth of its size (codecs.md)"
     return "DeepJSCC and WITT stay competitive on success", here, worst(found)
 
 

@@ -9,6 +9,7 @@ from comvla_sim.experiments.statistics import p_text
 from comvla_sim.paper.cells import BUDGETS, PAPER_CELLS, Cell
 from comvla_sim.paper.changes import (
     ALL_EPISODES,
+    SOME_SUITES,
     STAND_IN,
     change,
     change_text,
@@ -81,6 +82,8 @@ def success_verdict(
         return Verdict(UNTESTED, "not measured yet")
     if results.stand_in:
         return STAND_IN
+    if suite is None and results.some_suites:
+        return SOME_SUITES
     if results.libero:
         return compare_rates(_published(paper, suite), ours)
     if cell == reference:
@@ -130,8 +133,9 @@ def _success(results: Results, suite: str | None) -> Table:
         )
     return Table(
         f"Success{where}",
-        "Percent of episodes, with Wilson's 95 % interval; change in points from all 512 tokens, on the tables that "
-        "both were run on. "
+        "Percent of episodes, with Wilson's 95 % interval; change in points from all 512 tokens, on the layouts that "
+        "both were run on. K is “own” where a method decides itself how much it sends; “named thing kept” is how often "
+        "a token of the thing that the instruction names was among those sent. "
         + (
             "The verdict compares the rates."
             if results.libero
@@ -191,7 +195,7 @@ def _against_random(results: Results) -> Table:
         )
     return Table(
         "Hard voting against random tokens at equal K",
-        "Points of success by which hard voting is ahead on the tables that both were run on; how many pairs that "
+        "Points of success by which hard voting is ahead on the layouts that both were run on; how many pairs that "
         "are, and in how many only one of the two succeeded (exact McNemar test, two-sided, not corrected for the "
         "number of tests).",
         ("", "paper", "here", "pairs", "only hard voting", "only random", "p", "verdict"),

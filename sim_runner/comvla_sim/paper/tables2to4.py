@@ -7,11 +7,13 @@ from comvla_sim.paper import analytic
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.changes import (
     ALL_EPISODES,
+    SOME_SUITES,
     STAND_IN,
     change,
     change_text,
     change_verdict,
     gap_text,
+    lead_verdict,
 )
 from comvla_sim.paper.published import (
     EPISODES_PER_SUITE,
@@ -102,7 +104,7 @@ def table3(results: Results) -> list[Table]:
         if k == TABLE_K:
             printed = TABLE3["hard_voting"][1], TABLE3["soft_voting"][1]
             gap = change_text(printed[0] - printed[1])
-            verdict = change_verdict(results, (hard, soft), printed)
+            verdict = lead_verdict(results, (hard, soft), printed)
         rows.append(
             (
                 f"K = {k}",
@@ -124,7 +126,7 @@ def table3(results: Results) -> list[Table]:
     ]
     voting = Table(
         "Hard against soft voting",
-        "Percent of episodes with Wilson's 95 % intervals; points by which hard voting is ahead on the tables that "
+        "Percent of episodes with Wilson's 95 % intervals; points by which hard voting is ahead on the layouts that "
         "both were run on; how many pairs that are, and in how many only hard or only soft voting "
         "succeeded (exact McNemar test).",
         (
@@ -193,7 +195,7 @@ def table4(results: Results) -> list[Table]:
     formats = Table(
         f"Number formats at K = {TABLE_K}",
         "KiB as in Table I; percent of episodes with Wilson's 95 % intervals; change in points from float16, on the "
-        "tables that both were run on; p of the paired test against int8.",
+        "layouts that both were run on; p of the paired test against int8.",
         (
             "format",
             "paper, KiB",
@@ -217,6 +219,8 @@ def _format_verdict(results: Results, cell: Cell, reference: Cell, ours: Rate | 
         return _NOT_YET.text
     if results.stand_in:
         return STAND_IN.text
+    if results.some_suites:
+        return SOME_SUITES.text
     average = TABLE4[cell.quantization][2]
     if results.libero:
         return compare_rates(Rate.of_percent(average, ALL_EPISODES), ours).text
