@@ -48,8 +48,10 @@ class _Watch:
         self._thread.join()
 
     def _work(self) -> None:
-        asleep = time.monotonic()
-        while not self._over.wait(_LOOK_EVERY_S):
+        asleep, over = time.monotonic(), False
+        # The last look counts too: the check may have failed at once, when a stall was over.
+        while not over:
+            over = self._over.wait(_LOOK_EVERY_S)
             awake = time.monotonic()
             self.longest_s = max(self.longest_s, awake - asleep - _LOOK_EVERY_S)
             asleep = awake
