@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 
 import markdown
 import pytest
 
+import comvla_client
 from comvla_client.registry import SELECTORS
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
@@ -37,8 +39,24 @@ def unregistered() -> Iterator[None]:
     SELECTORS.update(before)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=str)
-def test_example_runs(example: markdown.Block, server: BackgroundServer) -> None:
+def run(example: markdown.Block, server: BackgroundServer) -> None:
     code = example.code.replace(PRINTED_ADDRESS, server.target)
     # The padding makes a failure point at the line of the page.
     exec(compile("\n" * (example.line - 1) + code, str(example.page), "exec"), {})
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=str)
+def test_example_runs(example: markdown.Block, server: BackgroundServer) -> None:
+    run(example, server)
+
+
+def test_the_first_example_prints_what_is_written_beside_it(
+    server: BackgroundServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The default deadline is a robot's: a busy machine may miss it.
+    patient = functools.partial(comvla_client.ComVLAClient, deadline_s=60.0)
+    monkeypatch.setattr(comvla_client, "ComVLAClient", patient)
+    [example] = [e for e in EXAMPLES if e.page.name == "README.md" and "robot.step" in e.code]
+    assert '# "cloud" and (8, 4)' in example.code
+    run(example, server)
+    assert capsys.readouterr().out.startswith("cloud (8, 4)\n")

@@ -129,7 +129,7 @@ def test_the_admin_surface_of_the_guide_takes_the_token_of_prometheus(
 ) -> None:
     context = ssl.create_default_context(cafile=str(folder / "ca.pem"))
     token = (folder / "prometheus.token").read_text().strip()
-    with httpx.Client(base_url=server[1], verify=context) as http:
+    with httpx.Client(base_url=server[1], verify=context, timeout=PATIENCE_S) as http:
         assert http.get("/readyz").status_code == 200
         assert http.get("/metrics").status_code == 401
         metrics = http.get("/metrics", headers={"authorization": f"Bearer {token}"})

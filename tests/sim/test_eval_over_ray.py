@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import multiprocessing
+import os
 import socket
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from comvla_sim.experiments import over_ray, runner
+from comvla_sim.experiments import over_processes, over_ray, runner
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
 from comvla_sim.experiments.results import ResultsFile, Row
+from comvla_sim.experiments.worker import Measured
 
 pytestmark = pytest.mark.simulator
 
@@ -24,6 +30,9 @@ SPECS = [
     for k in (8, 4)
     for task in ("drawer-open", "lever-down")
 ]
+GATE = "COMVLA_TEST_GATE"
+PATIENCE_S = 60.0
+RUN_IN_WORKER = over_processes._run_in_worker
 
 
 def measure(
@@ -70,10 +79,26 @@ def two_nodes() -> Iterator[str]:
         cluster.shutdown()
 
 
+def run_behind_the_gate(settings: EvalSettings, spec: EpisodeSpec) -> Measured:
+    """In a worker: an episode. All but the first wait until there is a file."""
+    deadline = time.monotonic() + PATIENCE_S
+    while spec != SPECS[0] and not os.path.exists(os.environ[GATE]):
+        assert time.monotonic() < deadline, "nobody opened the gate"
+        time.sleep(0.01)
+    return RUN_IN_WORKER(settings, spec)
+
+
 @pytest.mark.slow
 def test_two_processes_measure_what_one_does_though_a_worker_is_killed(
-    tmp_path: Path, one_process: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    one_process: list[dict[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # However late this process hears of the first episode, the others are not over by then.
+    gate = tmp_path / "gate"
+    monkeypatch.setenv(GATE, str(gate))
+    monkeypatch.setattr(over_processes, "_run_in_worker", run_behind_the_gate)
     killed: list[int] = []
 
     def kill_one(row: Row) -> None:
@@ -81,6 +106,7 @@ def test_two_processes_measure_what_one_does_though_a_worker_is_killed(
             victim = multiprocessing.active_children()[0]
             victim.kill()
             killed.append(victim.pid or 0)
+            gate.touch()
 
     assert measure(tmp_path / "rows.jsonl", workers=2, on_row=kill_one) == one_process
     assert killed
@@ -102,26 +128,43 @@ def test_an_episode_of_a_killed_ray_worker_runs_again(
     killed: list[int] = []
 
     def kill_one(row: Row) -> None:
-        named = ("ray::episode_on_node",)
-        mine = psutil.Process().children(recursive=True)
-        victims = [p for p in mine if " ".join(p.cmdline()).startswith(named)]
-        if victims and not killed:
-            victims[0].kill()
-            killed.append(victims[0].pid)
+        for process in psutil.Process().children(recursive=True):
+            # A process of Ray's may have ended since it was listed.
+            with contextlib.suppress(psutil.Error):
+                if not killed and " ".join(process.cmdline()).startswith("ray::episode_on_node"):
+                    process.kill()
+                    killed.append(process.pid)
 
     rows = measure(tmp_path / "rows.jsonl", ray=two_nodes, on_row=kill_one)
     assert rows == one_process
     assert killed, "no worker was found to kill"
 
 
-def test_a_cluster_that_does_not_answer_is_named_in_time(
+def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="needs Ray: pip install 'comvla[ray]'")
+    # Bound and never listened at: nobody else can take it.
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(EvaluationError, match=f"no Ray cluster answers at {address}"):
+            measure(tmp_path / "rows.jsonl", ray=address)
+    assert (tmp_path / "rows.jsonl").read_text() == ""
+
+
+def test_a_cluster_that_does_not_answer_is_named_before_ray_gives_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("ray", reason="needs Ray: pip install 'comvla[ray]'")
+    over = threading.Event()
+    silent = SimpleNamespace(is_initialized=lambda: False, init=lambda **_: over.wait(PATIENCE_S))
+    monkeypatch.setattr(over_ray, "_ray", lambda: silent)
+    monkeypatch.setattr(over_ray, "JOIN_TIMEOUT_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-    with pytest.raises(EvaluationError, match=rf"no Ray cluster answers at 127.0.0.1:{port}"):
-        measure(tmp_path / "rows.jsonl", ray=f"127.0.0.1:{port}")
+        address = f"127.0.0.1:{listening.getsockname()[1]}"
+        try:
+            with pytest.raises(EvaluationError, match=rf"{address}.*no answer within 0\.1 s"):
+                measure(tmp_path / "rows.jsonl", ray=address)
+        finally:
+            over.set()
     assert (tmp_path / "rows.jsonl").read_text() == ""
 
 

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from comvla_sim.worlds.libero.errors import (
 from comvla_sim.worlds.libero.process import SimulatorProcess
 
 STEP = {"action": np.zeros(7)}
+PATIENCE_S = 60.0
 PARENT = """
 import os, sys
 from comvla_sim.worlds.libero.process import SimulatorProcess
@@ -35,7 +36,7 @@ if sys.argv[1] == "wait":
 """
 
 
-def is_gone(pid: int, *, within_s: float = 20.0) -> bool:
+def is_gone(pid: int, *, within_s: float = PATIENCE_S) -> bool:
     """Whether a process ends in that time. One that waits for its parent to notice counts as ended."""
     deadline = time.monotonic() + within_s
     while time.monotonic() < deadline:
@@ -47,6 +48,33 @@ def is_gone(pid: int, *, within_s: float = 20.0) -> bool:
             return True
         time.sleep(0.02)
     return False
+
+
+@pytest.fixture
+def thinking(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimulatorProcess]:
+    """A child that hangs on its first request, and something to do as soon as it does.
+
+    What a caller waits for begins when the child is there, however long a busy machine takes to let
+    it run.
+    """
+
+    def make(then: Callable[[], object] = lambda: None) -> SimulatorProcess:
+        process = fake_process("hangs")
+        send = process._send
+
+        def send_and_wait(request: bytes, deadline: float) -> None:
+            patient = time.monotonic() + PATIENCE_S
+            send(request, patient)
+            # Not by seek and read: the child writes at the same position of the same open file.
+            while b"thinking" not in os.pread(process._stderr.fileno(), 4000, 0):
+                assert time.monotonic() < patient, "the child never began to think"
+                time.sleep(0.01)
+            then()
+
+        monkeypatch.setattr(process, "_send", send_and_wait)
+        return process
+
+    return make
 
 
 @pytest.fixture
@@ -100,8 +128,8 @@ def test_a_death_is_reported_with_its_cause_and_last_words(behaviour: str, words
         process.ask("draw")
 
 
-def test_no_answer_in_time_ends_the_child() -> None:
-    process = fake_process("hangs")
+def test_no_answer_in_time_ends_the_child(thinking: Callable[..., SimulatorProcess]) -> None:
+    process = thinking()
     with pytest.raises(SimulatorTimeoutError, match=r"no answer in 0.2 s.*\n[\s\S]*thinking"):
         process.ask("step", arrays=STEP, timeout_s=0.2)
     assert is_gone(process.pid)
@@ -128,19 +156,25 @@ def test_a_simulator_that_cannot_start_says_why() -> None:
         SimulatorProcess([sys.executable, "-c", "1 / 0"], {})
 
 
-def test_ctrl_c_in_the_middle_of_an_answer_ends_the_child() -> None:
-    process = fake_process("hangs")
+def test_ctrl_c_in_the_middle_of_an_answer_ends_the_child(
+    thinking: Callable[..., SimulatorProcess],
+) -> None:
+    # Set only when the child has the request: earlier, it might strike outside of `raises`.
+    process = thinking(lambda: signal.setitimer(signal.ITIMER_REAL, 0.2))
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
+    # pytest's own limit on a test has the same timer.
+    limit = signal.setitimer(signal.ITIMER_REAL, 0.0)
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
-        signal.setitimer(signal.ITIMER_REAL, 0.2)
         with pytest.raises(KeyboardInterrupt):
             process.ask("step", arrays=STEP)
     finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_REAL, *limit)
     assert is_gone(process.pid)
     assert process.closed
 
@@ -164,5 +198,5 @@ def test_nothing_is_left_behind_however_the_parent_ends(end: str) -> None:
     pid = int(parent.stdout.readline())
     if end != "exit":
         os.kill(parent.pid, signal.SIGKILL if end == "kill" else signal.SIGINT)
-    parent.communicate(timeout=30)
+    parent.communicate(timeout=PATIENCE_S)
     assert is_gone(pid)
