@@ -200,6 +200,7 @@ def test_another_model_is_seen(
     assert "same checkpoint" in findings["edge"]["remedy"]
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_server_that_goes_away_is_noticed(capsys: pytest.CaptureFixture[str]) -> None:
     class Fickle(StubService):
         asked = 0
