@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +27,7 @@ from comvla.v1.policy_pb2 import (
     LoadHint,
     ServerTimings,
 )
-from comvla_client import LinkProfile, TransportError
+from comvla_client import AsyncComVLAClient, ComVLAClient, LinkProfile, TransportError
 
 INFO = ModelInfo(
     name="stub",
@@ -227,6 +228,24 @@ def serving(service: StubService | None = None, port: int = 0) -> Iterator[tuple
     finally:
         server.stop(grace=None).wait()
         pool.shutdown(wait=True)
+
+
+@contextmanager
+def reserved_port() -> Iterator[int]:
+    """A port that one server after another may take, and nothing else on this machine.
+
+    Who only closes a port and binds it again later may find it taken meanwhile, by a listener or an
+    outgoing connection. A socket that is bound and does not listen keeps those away; calls are refused.
+    """
+    with socket.socket() as keeper:
+        keeper.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        keeper.bind(("127.0.0.1", 0))
+        yield int(keeper.getsockname()[1])
+
+
+def set_deadline(client: ComVLAClient | AsyncComVLAClient, deadline_s: float) -> None:
+    """What the steps to come have: much where an answer is meant to come, little where none can."""
+    client._core.deadline_s = deadline_s
 
 
 def never_answer(request: InferRequest, context: grpc.ServicerContext) -> None:

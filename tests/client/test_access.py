@@ -49,7 +49,7 @@ def test_step_and_doctor_bring_the_token_of_a_file(
     file.touch(mode=0o600)
     file.write_text("open\n")
     with serving(Asking()) as (target, service):
-        assert main(["step", target, "--token-file", str(file)]) == 0
+        assert main(["step", target, "--token-file", str(file), "--deadline-s", "20"]) == 0
         main(["doctor", target, "--token-file", str(file), "--calls", "2"])
         assert "ok   handshake" in capsys.readouterr().out
         assert set(service.tokens) == {"Bearer open"}

@@ -23,7 +23,9 @@ from client_stubs import (
     never_answer,
     observation,
     other_model,
+    reserved_port,
     serving,
+    set_deadline,
 )
 
 from comvla.errors import HandshakeError, InstructionError, ObservationError
@@ -48,6 +50,7 @@ async def test_both_forms_give_the_same_on_the_same_input() -> None:
         "execute": 3,
         "selector": "random",
         "seed": 5,
+        "deadline_s": 20.0,
     }
     snrs = (10.0, 3.0, 20.0, float("-inf"), 12.0)
     with ComVLAClient(StubTransport(*SCRIPT), **options) as client:
@@ -66,6 +69,7 @@ async def test_both_forms_give_the_same_on_the_same_input() -> None:
         assert left.to_dict() == right.to_dict()
 
 
+@pytest.mark.usefixtures("patient")
 async def test_a_step_over_a_real_socket() -> None:
     with serving() as (target, service):
         async with aio_client_of(target) as client:
@@ -127,18 +131,26 @@ async def test_a_server_that_never_answers() -> None:
                 lateness_s.append(time.perf_counter() - began - 0.005)
             assert np.percentile(overruns_s, 95) <= 0.010 + np.percentile(lateness_s, 95)
             service.before = None
-            chunks = [await client.step(OBS, WORDS) for _ in range(5)]
-            assert "cloud" in [chunk.source for chunk in chunks]
+            set_deadline(client, 20.0)
+            assert (await client.step(OBS, WORDS)).source == "cloud"
 
 
 async def test_a_server_that_returns_is_found_by_the_first_step_after_it() -> None:
-    with serving() as (target, _):
-        client = aio_client_of(target, deadline_s=0.5)
-        assert (await client.step(OBS, WORDS)).source == "cloud"
-    for _ in range(4):
-        assert (await client.step(OBS, WORDS)).report.fallback_reason == "unavailable"
-    with serving(port=int(target.rpartition(":")[2])):
-        assert (await client.step(OBS, WORDS)).source == "cloud"
+    with reserved_port() as port:
+        with serving(port=port) as (target, _):
+            client = aio_client_of(target)
+            assert (await client.step(OBS, WORDS)).source == "cloud"
+        set_deadline(client, 0.5)
+        # A machine that is busy may miss half a second; three times in a row it does not.
+        for _ in range(3):
+            reasons = {(await client.step(OBS, WORDS)).report.fallback_reason for _ in range(4)}
+            assert "unavailable" in reasons
+            assert reasons <= {"unavailable", "deadline"}
+            with serving(port=port):
+                chunk = await client.step(OBS, WORDS)
+            if chunk.source == "cloud":
+                break
+        assert chunk.source == "cloud"
         await client.close()
 
 
@@ -247,6 +259,7 @@ async def test_an_edge_half_that_takes_all_the_time_sends_nothing() -> None:
     assert transport.inner.requests == []
 
 
+@pytest.mark.usefixtures("patient")
 async def test_a_connection_that_lives_is_kept_though_a_call_goes_unanswered() -> None:
     service = StubService()
     service.before = never_answer

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from client_stubs import reserved_port, set_deadline
 
 from comvla import codec
 from comvla.errors import HandshakeError, InstructionError
@@ -37,10 +38,6 @@ def client_of(target: str, policy: Policy, **options: Any) -> ComVLAClient:
     # A deadline that a busy machine can keep: these tests are about answers, not about time.
     options = {"edge": policy[0], "link": LINK, "deadline_s": 20.0, **options}
     return ComVLAClient(target, **options)
-
-
-def port_of(target: str) -> int:
-    return int(target.rpartition(":")[2])
 
 
 @pytest.mark.parametrize("quantization", codec.QUANTIZATIONS)
@@ -106,29 +103,31 @@ def test_edge_and_server_of_different_policies_never_meet(server: BackgroundServ
 
 
 def test_a_drained_server_that_returns_is_found_again(policy: Policy) -> None:
-    with BackgroundServer(Engine(policy[1])) as first:
-        target = first.target
-        client = client_of(target, policy, execute=5, deadline_s=0.5)
-        assert client.step(observation(), WORDS, 5.0).source == "cloud"
-    with client:
-        sources = [client.step(observation(), WORDS, 5.0).source for _ in range(3)]
-        assert sources == ["rest", "hold", "hold"]
-        with BackgroundServer(Engine(policy[1]), ServerSettings(port=port_of(target))):
-            sources = [client.step(observation(), WORDS, 5.0).source for _ in range(2)]
-            assert sources[1] == "cloud", "two periods after its return"
+    with reserved_port() as port:
+        settings = ServerSettings(port=port)
+        with BackgroundServer(Engine(policy[1]), settings) as first:
+            client = client_of(first.target, policy, execute=5)
+            assert client.step(observation(), WORDS, 5.0).source == "cloud"
+        with client:
+            set_deadline(client, 0.5)
+            sources = [client.step(observation(), WORDS, 5.0).source for _ in range(3)]
+            assert sources == ["rest", "hold", "hold"]
+            set_deadline(client, 20.0)
+            with BackgroundServer(Engine(policy[1]), settings):
+                assert client.step(observation(), WORDS, 5.0).source == "cloud"
 
 
 def test_a_server_that_returns_with_another_model_raises(policy: Policy) -> None:
-    with BackgroundServer(Engine(policy[1])) as first:
-        target = first.target
-        client = client_of(target, policy)
-    settings = ServerSettings(port=port_of(target))
-    with (
-        client,
-        BackgroundServer(Engine(random_policy(seed=1)[1]), settings),
-        pytest.raises(HandshakeError, match="same checkpoint"),
-    ):
-        client.step(observation(), WORDS, 5.0)
+    with reserved_port() as port:
+        settings = ServerSettings(port=port)
+        with BackgroundServer(Engine(policy[1]), settings) as first:
+            client = client_of(first.target, policy)
+        with (
+            client,
+            BackgroundServer(Engine(random_policy(seed=1)[1]), settings),
+            pytest.raises(HandshakeError, match="same checkpoint"),
+        ):
+            client.step(observation(), WORDS, 5.0)
 
 
 @contextmanager
@@ -154,21 +153,25 @@ def server_process(checkpoint: Path, port: int) -> Iterator[tuple[subprocess.Pop
 @pytest.mark.alone
 def test_a_server_killed_and_restarted_in_mid_episode(policy: Policy, checkpoint: Path) -> None:
     """No exception, the rest of the chunk, holding, and back with the first step after its return."""
-    sources = []
-    with server_process(checkpoint, 0) as (process, target):
-        client = client_of(target, policy, deadline_s=0.4, execute=5)
-        for i in range(3):
-            sources.append(client.step(observation(i), WORDS, 8.0).source)
-        process.kill()
-        process.wait()
-        for i in range(3, 8):
-            chunk = client.step(observation(i), WORDS, 8.0)
-            sources.append(chunk.source)
-            assert chunk.report.fallback_reason == "unavailable"
-            assert chunk.actions.shape == (8, 4)
-            assert np.isfinite(chunk.actions).all()
-    with client, server_process(checkpoint, port_of(target)):
-        sources += [client.step(observation(i), WORDS, 8.0).source for i in (8, 9)]
-    assert sources[3:8] == ["rest", "hold", "hold", "hold", "hold"]
-    # The first step may meet a cold server on a busy machine; the second period is the promise.
-    assert sources[9] == "cloud", sources
+    sources, reasons = [], []
+    with reserved_port() as port:
+        with server_process(checkpoint, port) as (process, target):
+            client = client_of(target, policy, execute=5)
+            for i in range(3):
+                sources.append(client.step(observation(i), WORDS, 8.0).source)
+            process.kill()
+            process.wait()
+            set_deadline(client, 0.4)
+            for i in range(3, 8):
+                chunk = client.step(observation(i), WORDS, 8.0)
+                sources.append(chunk.source)
+                reasons.append(chunk.report.fallback_reason)
+                assert chunk.actions.shape == (8, 4)
+                assert np.isfinite(chunk.actions).all()
+        with client, server_process(checkpoint, port):
+            set_deadline(client, 20.0)
+            sources.append(client.step(observation(8), WORDS, 8.0).source)
+    assert sources == ["cloud"] * 3 + ["rest", "hold", "hold", "hold", "hold"] + ["cloud"]
+    # On a busy machine the edge half may have taken all of a step's time.
+    assert "unavailable" in reasons
+    assert set(reasons) <= {"unavailable", "deadline"}

@@ -48,10 +48,15 @@ def examined(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, d
 
 
 def test_a_real_server_is_examined_from_end_to_end(
-    server: BackgroundServer, checkpoint: Path, capsys: pytest.CaptureFixture[str]
+    server: BackgroundServer,
+    checkpoint: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    # Time enough for a busy machine, but none of it for a ping that is due after ten seconds.
+    monkeypatch.setattr(silence, "PING_PERIOD_S", 0.1)
     findings = examined(
-        capsys, server.target, "--edge", str(checkpoint), "--calls", "5", "--seconds", "10"
+        capsys, server.target, "--edge", str(checkpoint), "--calls", "5", "--seconds", "60"
     )
     order = [name for name in findings if not name.startswith("tcp_")]
     assert order[:4] == ["torch", "reach", "handshake", "edge"]
@@ -200,6 +205,7 @@ def test_another_model_is_seen(
     assert "same checkpoint" in findings["edge"]["remedy"]
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_server_that_goes_away_is_noticed(capsys: pytest.CaptureFixture[str]) -> None:
     class Fickle(StubService):
         asked = 0

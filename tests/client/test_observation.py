@@ -50,7 +50,7 @@ BAD_OBSERVATIONS: dict[str, tuple[Any, str]] = {
 def test_a_bad_observation_is_refused_before_anything_is_sent(name: str) -> None:
     obs, words = BAD_OBSERVATIONS[name]
     edge, transport = StubEdge(), StubTransport()
-    with ComVLAClient(transport, edge=edge, budget=4) as client:
+    with ComVLAClient(transport, edge=edge, budget=4, deadline_s=20.0) as client:
         with pytest.raises(ObservationError, match=words):
             client.step(obs, WORDS)
         assert transport.requests == []
@@ -70,7 +70,7 @@ def test_a_bad_observation_is_refused_before_anything_is_sent(name: str) -> None
 )
 def test_a_bad_instruction_is_refused_before_anything_is_sent(instruction: Any, words: str) -> None:
     edge, transport = StubEdge(), StubTransport()
-    with ComVLAClient(transport, edge=edge, budget=4) as client:
+    with ComVLAClient(transport, edge=edge, budget=4, deadline_s=20.0) as client:
         with pytest.raises(InstructionError, match=words):
             client.step(GOOD, instruction)
         assert transport.requests == []

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from client_stubs import StubEdge, StubService, StubTransport, model_response, serving
 from stalling_link import StallingLink
+from waiting import until
 
 from comvla import codec
 from comvla.errors import HandshakeError
 from comvla.v1.policy_pb2 import InferRequest
 from comvla_client import AsyncComVLAClient, ComVLAClient, LinkProfile
+from comvla_client.report import ActionChunk
 from comvla_client.sending import Progressive
 from comvla_client.streaming import BURST_PIECES, PayloadStream, paced
 from comvla_server.background import BackgroundServer
@@ -21,6 +23,8 @@ from comvla_vla import CloudModel, EdgeModel
 
 # A window that a busy machine can keep to: the link decides what arrives, not the clock.
 LINK = LinkProfile(bandwidth_hz=0.88e6, period_s=0.3)
+# One for steps that have to arrive whole.
+WIDE = LinkProfile(bandwidth_hz=0.88e6, period_s=1.0)
 WORDS = "pull the green drawer open"
 TOKENS = 24
 Policy = tuple[EdgeModel, CloudModel]
@@ -48,11 +52,23 @@ def port_of(server: BackgroundServer) -> int:
     return int(server.target.rpartition(":")[2])
 
 
+def whole_bytes(client: ComVLAClient) -> int:
+    """Bytes of a step that arrived whole, which a busy machine may fail to hand out in time at first."""
+    reports = []
+
+    def whole() -> bool:
+        reports.append(client.step(observation(9), WORDS).report)
+        return reports[-1].tokens_used == TOKENS
+
+    until(whole)
+    return int(reports[-1].framed_bytes)
+
+
 def test_over_a_good_link_pieces_are_answered_as_the_whole(
     policy: Policy, server: BackgroundServer
 ) -> None:
     with (
-        client_of(server.target, policy) as client,
+        client_of(server.target, policy, link=WIDE) as client,
         client_of(server.target, policy, sending="paper") as unary,
     ):
         for seed in range(3):
@@ -70,10 +86,10 @@ def test_when_the_link_stops_the_prefix_is_answered_bit_for_bit(
     policy: Policy, server: BackgroundServer
 ) -> None:
     with StallingLink(port_of(server)) as link, client_of(link.target, policy) as client:
-        whole_bytes = client.step(observation(9), WORDS).report.framed_bytes
+        all_bytes = whole_bytes(client)
         arrived = []
         for seed, share in enumerate((0.35, 0.6, 0.85)):
-            link.stall_after(int(share * whole_bytes))
+            link.stall_after(int(share * all_bytes))
             cut = client.step(observation(seed), WORDS)
             link.go_on()
             assert cut.source == "cloud"
@@ -84,7 +100,7 @@ def test_when_the_link_stops_the_prefix_is_answered_bit_for_bit(
             positions = cut.report.positions[: arrived[-1]]
             np.testing.assert_array_equal(positions, whole.report.positions)
         assert 0 < arrived[0] < arrived[1] < arrived[2] < TOKENS
-        assert client.step(observation(7), WORDS).report.tokens_used == TOKENS, "it recovers"
+        whole_bytes(client)  # it recovers
 
 
 def test_a_link_that_stops_too_early_is_a_fallback_and_nothing_worse(
@@ -94,20 +110,19 @@ def test_a_link_that_stops_too_early_is_a_fallback_and_nothing_worse(
         StallingLink(port_of(server)) as link,
         client_of(link.target, policy, min_tokens=8) as client,
     ):
-        first = client.step(observation(), WORDS)
-        link.stall_after(first.report.framed_bytes // 4)
+        link.stall_after(whole_bytes(client) // 4)
         lost = client.step(observation(1), WORDS)
         link.go_on()
         assert (lost.source, lost.report.fallback_reason) == ("hold", "deadline")
         assert "at least 8 whole tokens" in lost.report.detail
         assert lost.report.tokens_used == 0
-        assert client.step(observation(2), WORDS).source == "cloud"
+        whole_bytes(client)  # it recovers
 
 
 async def test_the_asyncio_client_sends_pieces_too(
     policy: Policy, server: BackgroundServer
 ) -> None:
-    with client_of(server.target, policy) as client:
+    with client_of(server.target, policy, link=WIDE) as client:
         expected = client.step(observation(3), WORDS)
     with StallingLink(port_of(server)) as link:
         async with AsyncComVLAClient(
@@ -118,13 +133,22 @@ async def test_the_asyncio_client_sends_pieces_too(
             budget=TOKENS,
             sending="progressive",
         ) as client_aio:
-            came = await client_aio.step(observation(3), WORDS)
+
+            async def whole() -> ActionChunk:
+                for _ in range(20):  # a busy machine may not hand out all in time at first
+                    chunk = await client_aio.step(observation(3), WORDS)
+                    if chunk.report.tokens_used == TOKENS:
+                        break
+                assert chunk.report.tokens_used == TOKENS
+                return chunk
+
+            came = await whole()
             np.testing.assert_array_equal(came.actions, expected.actions)
             link.stall_after(came.report.framed_bytes * 2 // 3)
             cut = await client_aio.step(observation(4), WORDS)
             link.go_on()
             assert 0 < cut.report.tokens_used < TOKENS
-            assert (await client_aio.step(observation(5), WORDS)).report.tokens_used == TOKENS
+            await whole()  # it recovers
 
 
 def test_a_server_without_pieces_is_refused_in_the_handshake() -> None:

@@ -139,7 +139,8 @@ class Backwards:
 
 def test_a_selector_of_ones_own_drives_the_client() -> None:
     edge, transport = StubEdge(), StubTransport()
-    with ComVLAClient(transport, edge=edge, link=NARROW, selector=Backwards(), budget=3) as client:
+    options: dict[str, Any] = {"selector": Backwards(), "budget": 3, "deadline_s": 20.0}
+    with ComVLAClient(transport, edge=edge, link=NARROW, **options) as client:
         report = client.step(observation(), WORDS).report
     assert report.positions.tolist() == [31, 30, 29]
     assert "project" not in edge.calls

@@ -6,27 +6,35 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
 from client_stubs import StubEdge, serving
+from waiting import until
 
 from comvla_client.cli import main
+from comvla_client.commands import snr as snr_command
 from comvla_client.commands import snr_arguments
 from comvla_client.commands import step as step_command
 from comvla_client.snr.polled import Measurement, PolledSource
+
+DEADLINE = ("--deadline-s", "20")  # one that a busy machine can keep
 
 
 class Radio(PolledSource):
     """A device that hears 17 dB once, and then nothing more."""
 
     opened_with: ClassVar[list[Any]] = []
+    last: ClassVar[Radio]
     closed = False
 
     def __init__(self, which: str | None = None) -> None:
-        super().__init__(0.001)
+        super().__init__(0.001, start_timeout_s=60.0)
         Radio.opened_with.append(which)
+        Radio.last = self
         self._start()
 
     def _measure(self) -> Measurement:
@@ -61,9 +69,18 @@ def test_readings_are_printed_as_json_lines(
 
 
 def test_a_radio_is_shown_with_what_is_behind_its_reading_and_what_is_wrong(
-    radio: type[Radio], capsys: pytest.CaptureFixture[str]
+    radio: type[Radio], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    paused_s: list[float] = []
+
+    def pause(seconds: float) -> None:
+        paused_s.append(seconds)
+        until(lambda: radio.last.problem is not None)
+
+    clock = SimpleNamespace(monotonic=time.monotonic, sleep=pause)
+    monkeypatch.setattr(snr_command, "time", clock)
     assert main(["snr", "modem:3", "--count", "3", "--interval-s", "0.05"]) == 0
+    assert paused_s == [0.05, 0.05]
     assert radio.opened_with == ["3"]
     assert radio.closed
     lines = capsys.readouterr().out.splitlines()
@@ -123,16 +140,17 @@ def test_ctrl_c_ends_the_display_quietly() -> None:
         assert display.stderr.read() == ""
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_step_is_sized_by_the_source_that_was_chosen(
     radio: type[Radio], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(step_command, "load_edge", lambda source: StubEdge())
     with serving() as (target, service):
-        assert main(["step", target, "--snr-source", "wifi", "--json"]) == 0
+        assert main(["step", target, "--snr-source", "wifi", "--json", *DEADLINE]) == 0
         assert service.requests[0].snr_db == 17.0
         assert radio.closed
         report = json.loads(capsys.readouterr().out)["report"]
         assert report["snr_db"] == 17.0
-        assert main(["step", target, "--snr-source", "constant:4"]) == 0
-        assert main(["step", target, "--snr-db", "5"]) == 0
+        assert main(["step", target, "--snr-source", "constant:4", *DEADLINE]) == 0
+        assert main(["step", target, "--snr-db", "5", *DEADLINE]) == 0
     assert [request.snr_db for request in service.requests[1:]] == [4.0, 5.0]

@@ -175,7 +175,7 @@ def test_goodput_alone_finds_what_an_enforced_link_carries() -> None:
     link = EnforcedLink(StubTransport(), ConstantChannel(6.0), WIDE)
     now_s = [0.0]
     source = GoodputSnr(WIDE, initial_db=20.0, clock=lambda: now_s[0])
-    with ComVLAClient(link, edge=StubEdge(), link=WIDE, budget=4) as robot:
+    with ComVLAClient(link, edge=StubEdge(), link=WIDE, budget=4, deadline_s=20.0) as robot:
         for _ in range(30):
             robot.step(observation(), WORDS, 6.0)
             record = link.log[-1]
@@ -195,7 +195,9 @@ def test_a_client_teaches_its_source_by_the_prefix_that_arrived() -> None:
     """
     link = EnforcedLink(StubTransport(), ConstantChannel(1.0), WIDE)
     source = GoodputSnr(WIDE, initial_db=20.0)
-    with ComVLAClient(link, edge=StubEdge(), link=WIDE, budget=32, snr=source) as robot:
+    with ComVLAClient(
+        link, edge=StubEdge(), link=WIDE, budget=32, snr=source, deadline_s=20.0
+    ) as robot:
         for _ in range(12):
             chunk = robot.step(observation(), WORDS)
             link.advance()
@@ -209,7 +211,9 @@ def test_lost_steps_lower_what_the_next_one_sends_and_silence_raises_it_again() 
     now_s = [0.0]
     source = GoodputSnr(NARROW, initial_db=15.0, clock=lambda: now_s[0])
     transport = StubTransport(*[fault("DEADLINE_EXCEEDED")] * 6)
-    with ComVLAClient(transport, edge=StubEdge(), link=NARROW, snr=source) as robot:
+    with ComVLAClient(
+        transport, edge=StubEdge(), link=NARROW, snr=source, deadline_s=20.0
+    ) as robot:
         sent = []
         for _ in range(6):
             sent.append(robot.step(observation(), WORDS).report.tokens)

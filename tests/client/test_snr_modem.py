@@ -34,7 +34,7 @@ def manager(address: str) -> Iterator[FakeModemManager]:
 
 
 def source(address: str, **options: Any) -> ModemManagerSnr:
-    return ModemManagerSnr(bus=address, poll_s=0.01, **options)
+    return ModemManagerSnr(bus=address, poll_s=0.01, **{"start_timeout_s": 60.0, **options})
 
 
 def test_it_reads_lte_and_asks_for_measurements(address: str, manager: FakeModemManager) -> None:

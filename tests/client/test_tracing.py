@@ -135,7 +135,9 @@ def test_a_step_without_an_answer_says_why(
         for span in spans.get_finished_spans()
         if span.name == "comvla.step"
     ]
-    assert reasons[0] == "unavailable"
+    # On a busy machine the edge half may take all of the time; it has little, as nobody answers.
+    assert reasons[0] in ("unavailable", "deadline")
+    assert reasons[1] == "no_link"
     # Words of errors name sessions and identities: a trace has the reason alone.
     for span in spans.get_finished_spans():
         assert span.events == ()
@@ -232,4 +234,6 @@ def test_spans_go_to_a_collector(policy: tuple[EdgeModel, CloudModel]) -> None:
         tracing.close()
     finally:
         collector.shutdown()
-    assert [path for path, _ in came] == ["/v1/traces", "/v1/traces"]
+    # Each side sends what it has at its end, and before that every few seconds.
+    assert {path for path, _ in came} == {"/v1/traces"}
+    assert len(came) >= 2

@@ -91,7 +91,7 @@ def test_filler_is_as_long_as_the_last_request_and_is_accounted_for() -> None:
 
 
 def test_a_client_with_warm_up_counts_its_filler_and_one_without_sends_none() -> None:
-    options: dict[str, Any] = {"edge": StubEdge(), "link": NARROW, "budget": 4}
+    options: dict[str, Any] = {"edge": StubEdge(), "link": NARROW, "budget": 4, "deadline_s": 20.0}
     with serving() as (target, _):
         with ComVLAClient(target, warm_up=True, **options) as client:
             assert client.step(observation(), WORDS).source == "cloud"
