@@ -118,12 +118,12 @@ def test_a_stop_lets_calls_in_flight_finish_and_refuses_new_ones(
     eventually(lambda: registry.get_sample_value("comvla_queue_depth") == 1)
 
     stopped: list[bool] = []
-    stopper = threading.Thread(target=lambda: stopped.append(server.stop()))
+    stopper = threading.Thread(target=lambda: stopped.append(server.stop(grace_s=PATIENCE_S)))
     stopper.start()
     health = health_pb2_grpc.HealthStub(robot.channel)
     request = health_pb2.HealthCheckRequest(service=SERVICE_NAME)
     eventually(lambda: health.Check(request).status == NOT_SERVING)
-    assert httpx.get(f"{server.admin_url}/readyz").json()["phase"] == "draining"
+    assert httpx.get(f"{server.admin_url}/readyz", timeout=PATIENCE_S).json()["phase"] == "draining"
     code, words = robot.refused(message("new"))
     assert code is grpc.StatusCode.UNAVAILABLE
     assert "draining and takes no new calls" in words
