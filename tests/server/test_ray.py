@@ -15,7 +15,7 @@ from typing import Any
 
 import grpc
 import pytest
-from server_stubs import PATIENCE_S, Robot, quiet_port
+from server_stubs import PATIENCE_S, Robot, eventually, quiet_port
 
 from comvla.errors import ComVLAError
 from comvla_server import cli
@@ -125,8 +125,9 @@ def test_robots_are_answered_refused_and_carried_over_the_loss_of_a_replica(targ
             assert report.source == "cloud", report.detail
         assert check_health(client._transport.access, PATIENCE_S) == "SERVING"  # type: ignore[attr-defined]
     with ComVLAClient(target, sending="progressive", snr=30.0, **options) as client:
-        report = client.step(observation, "push the button").report
-        assert report.source == "cloud", report.detail
+        # The window is a twentieth of a second, and Ray's proxy takes its part: on a busy machine a
+        # step may come too late.
+        eventually(lambda: client.step(observation, "push the button").report.source == "cloud")
     with Robot(target) as robot:
         code, words = robot.refused(policy_pb2.InferRequest())
         assert code is grpc.StatusCode.UNAUTHENTICATED
