@@ -296,12 +296,15 @@ def test_overload_is_resource_exhausted(engine: GatedEngine) -> None:
 
 
 def test_a_draining_server_is_unavailable(engine: GatedEngine) -> None:
-    with BackgroundServer(engine) as server, grpc.insecure_channel(server.target) as channel:
+    with (
+        BackgroundServer(engine, SETTINGS) as server,
+        grpc.insecure_channel(server.target) as channel,
+    ):
         stub = policy_pb2_grpc.PolicyServiceStub(channel)
         engine.shut()
         running = stub.Infer.future(request(engine.info), timeout=PATIENCE_S)
         engine.wait_until_inside()
-        stopper = threading.Thread(target=server.stop)
+        stopper = threading.Thread(target=server.stop, kwargs={"grace_s": PATIENCE_S})
         stopper.start()
         code = grpc.StatusCode.DEADLINE_EXCEEDED
         while code is grpc.StatusCode.DEADLINE_EXCEEDED:  # the stop is on its way

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 import httpx
 import pytest
-from server_stubs import eventually
+from server_stubs import PATIENCE_S, eventually, quiet_port
 
 PROMETHEUS = shutil.which("prometheus")
 
@@ -24,20 +23,19 @@ needs_prometheus = pytest.mark.skipif(
 
 @contextlib.contextmanager
 def prometheus(folder: Path, scraped: str) -> Iterator[httpx.Client]:
-    """A Prometheus that scrapes one address five times a second; yields a client of its API."""
+    """A Prometheus that scrapes one address twice a second; yields a client of its API."""
     config = folder / "prometheus.yml"
     config.write_text(
         json.dumps(
             {
-                "global": {"scrape_interval": "200ms", "scrape_timeout": "200ms"},
+                "global": {"scrape_interval": "500ms", "scrape_timeout": "500ms"},
                 "scrape_configs": [
                     {"job_name": "comvla", "static_configs": [{"targets": [scraped]}]}
                 ],
             }
         )
     )
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = quiet_port()
     arguments = [
         str(PROMETHEUS),
         f"--config.file={config}",
@@ -49,7 +47,7 @@ def prometheus(folder: Path, scraped: str) -> Iterator[httpx.Client]:
         subprocess.Popen(
             arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         ) as process,
-        httpx.Client(base_url=f"http://127.0.0.1:{port}") as http,
+        httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=PATIENCE_S) as http,
     ):
         try:
             assert eventually(lambda: _ready(http)), "Prometheus never became ready"

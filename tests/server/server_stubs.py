@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import random
+import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -188,6 +191,15 @@ def refusal_of(call: Any) -> tuple[grpc.StatusCode, str]:
     error = call.exception(timeout=PATIENCE_S)
     assert error is not None, "expected a refusal, the call was answered"
     return error.code(), error.details()
+
+
+def quiet_port() -> int:
+    """A port that is free, and stays it until a test takes it: outside the range from which systems
+    give ports to whoever asks for any, and to connections."""
+    while True:
+        port = random.SystemRandom().randrange(20_000, 30_000)
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
 
 
 def eventually(claim: Callable[[], Any], timeout_s: float = PATIENCE_S) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
-from server_stubs import STUB_INFO, Robot, StubCloud, message
+from server_stubs import PATIENCE_S, STUB_INFO, Robot, StubCloud, message
 
 from comvla_server.background import BackgroundServer
 from comvla_server.batcher import Batcher
@@ -14,7 +14,7 @@ from comvla_server.batcher import Batcher
 
 @pytest.fixture
 def http(server: BackgroundServer) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=server.admin_url) as client:
+    with httpx.Client(base_url=server.admin_url, timeout=PATIENCE_S) as client:
         yield client
 
 
@@ -94,7 +94,7 @@ async def test_model_and_sessions_are_unavailable_while_loading(cloud: StubCloud
     server = Server(Engine(cloud))
     await server.bind()
     try:
-        async with httpx.AsyncClient(base_url=server.admin_url) as http:
+        async with httpx.AsyncClient(base_url=server.admin_url, timeout=PATIENCE_S) as http:
             for path in ("/v1/model", "/v1/sessions"):
                 answer = await http.get(path)
                 assert answer.status_code == 503

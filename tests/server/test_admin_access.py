@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 from authorities import Authority
-from server_stubs import Robot, StubCloud, eventually, message
+from server_stubs import PATIENCE_S, Robot, StubCloud, eventually, message
 
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
@@ -41,7 +41,7 @@ def server(cloud: StubCloud, files: dict[str, Path]) -> Iterator[BackgroundServe
 
 @pytest.fixture
 def http(server: BackgroundServer) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=server.admin_url) as client:
+    with httpx.Client(base_url=server.admin_url, timeout=PATIENCE_S) as client:
         yield client
 
 
@@ -110,8 +110,8 @@ def test_operators_come_and_go_without_a_restart(
 
 def test_metrics_can_be_left_open(cloud: StubCloud, files: dict[str, Path]) -> None:
     with BackgroundServer(Engine(cloud), ServerSettings(**files, open_metrics=True)) as server:
-        assert httpx.get(f"{server.admin_url}/metrics").status_code == 200
-        assert httpx.get(f"{server.admin_url}/v1/model").status_code == 401
+        assert httpx.get(f"{server.admin_url}/metrics", timeout=PATIENCE_S).status_code == 200
+        assert httpx.get(f"{server.admin_url}/v1/model", timeout=PATIENCE_S).status_code == 401
 
 
 def test_an_unreadable_tokens_file_stops_the_start(
@@ -132,12 +132,12 @@ def test_over_tls_the_same(cloud: StubCloud, files: dict[str, Path], tmp_path: P
     with BackgroundServer(Engine(cloud), settings) as server:
         assert server.admin_url.startswith("https://127.0.0.1:")
         # Operators show a token; certificates are asked of robots only.
-        with httpx.Client(base_url=server.admin_url, verify=context) as http:
+        with httpx.Client(base_url=server.admin_url, verify=context, timeout=PATIENCE_S) as http:
             assert http.get("/healthz").status_code == 200
             assert http.get("/metrics").status_code == 401
             assert http.get("/metrics", headers=bearer(OPERATOR)).status_code == 200
         with pytest.raises(httpx.ConnectError):
-            httpx.get(f"{server.admin_url}/healthz")
+            httpx.get(f"{server.admin_url}/healthz", timeout=PATIENCE_S)
         with pytest.raises(httpx.RemoteProtocolError):
             httpx.get(server.admin_url.replace("https", "http"))
 

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ from comvla_vla.random import unit_statistics
 
 HERE = Path(__file__).parent
 FREE_PORTS = ("--port", "0", "--admin-port", "0")
+# A drain that waits for the test.
+PATIENT = (*FREE_PORTS, "--grace-s", str(PATIENCE_S))
 SERVING = health_pb2.HealthCheckResponse.SERVING
 NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
 READY = re.compile(r"comvla-server ready grpc=(\S+) admin=(http://\S+) model=(\S+)\n")
@@ -112,7 +114,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_sigterm_completes_the_request_in_flight_and_exits_cleanly(gate: Path) -> None:
-    with process(str(HERE / "gated_server.py"), str(gate), "serve", *FREE_PORTS) as running:
+    with process(str(HERE / "gated_server.py"), str(gate), "serve", *PATIENT) as running:
         target, admin, model = ready_line(running)
         assert model == "stub"
         with Robot(target) as robot:
@@ -124,7 +126,7 @@ def test_sigterm_completes_the_request_in_flight_and_exits_cleanly(gate: Path) -
                 eventually(
                     lambda: health.Check(asked).status == health_pb2.HealthCheckResponse.NOT_SERVING
                 )
-                assert httpx.get(f"{admin}/readyz").status_code == 503
+                assert httpx.get(f"{admin}/readyz", timeout=PATIENCE_S).status_code == 503
                 code, words = robot.refused(message("new"))
                 assert code is grpc.StatusCode.UNAVAILABLE
                 assert "draining" in words
@@ -136,41 +138,57 @@ def test_sigterm_completes_the_request_in_flight_and_exits_cleanly(gate: Path) -
 
 
 def test_a_second_signal_exits_at_once(gate: Path) -> None:
-    with process(str(HERE / "gated_server.py"), str(gate), "serve", *FREE_PORTS) as running:
+    with process(str(HERE / "gated_server.py"), str(gate), "serve", *PATIENT) as running:
         target, admin, _ = ready_line(running)
         with Robot(target) as robot:
             call = robot.send(message())
             with model_at(gate):
                 running.send_signal(signal.SIGTERM)
-                eventually(lambda: httpx.get(f"{admin}/readyz").status_code == 503)
+                eventually(
+                    lambda: httpx.get(f"{admin}/readyz", timeout=PATIENCE_S).status_code == 503
+                )
                 running.send_signal(signal.SIGTERM)
                 code, _ = end(running)
             assert call.exception(PATIENCE_S).code() is grpc.StatusCode.UNAVAILABLE
     assert code == 128 + signal.SIGTERM
 
 
+@contextlib.contextmanager
 def serve_here(
     monkeypatch: pytest.MonkeyPatch,
     cloud: StubCloud,
     operator: Callable[[Robot], None],
     *arguments: str,
-) -> int:
-    """Runs ``serve`` in this process until ``operator`` has returned; returns the exit code."""
+) -> Iterator[int]:
+    """Runs ``serve`` in this process until ``operator`` has returned; the exit code, with the
+    operator's robot still connected."""
     monkeypatch.setattr(serve_command, "load_engine", lambda *_: Engine(cloud))
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = str(free.getsockname()[1])
+    bound: Future[tuple[str, asyncio.AbstractEventLoop]] = Future()
+
+    class Told(Server):
+        async def bind(self) -> None:
+            await super().bind()
+            bound.set_result((self.target, asyncio.get_running_loop()))
+
+    monkeypatch.setattr("comvla_server.server.Server", Told)
 
     def operate() -> None:
+        target, loop = bound.result(PATIENCE_S)
         try:
-            operator(robot)
+            operator(held.enter_context(Robot(target)))
         finally:
-            os.kill(os.getpid(), signal.SIGTERM)
+            # From the loop that handles it: once that is gone, the signal would end the tests.
+            loop.call_soon_threadsafe(os.kill, os.getpid(), signal.SIGTERM)
 
-    with Robot(f"127.0.0.1:{port}") as robot, ThreadPoolExecutor(1) as pool:
-        operating = pool.submit(operate)
-        code = cli.main(["serve", "--port", port, "--admin-port", "0", *arguments])
-        operating.result()
-    return code
+    with contextlib.ExitStack() as held:
+        with ThreadPoolExecutor(1) as pool:
+            operating = pool.submit(operate)
+            try:
+                code = cli.main(["serve", *FREE_PORTS, *arguments])
+            finally:
+                bound.cancel()  # where it never came to that
+            operating.result()
+        yield code
 
 
 def test_calls_that_outlast_the_grace_are_an_exit_code(
@@ -186,8 +204,9 @@ def test_calls_that_outlast_the_grace_are_an_exit_code(
         cloud.wait_until_running()
 
     arguments = ("--grace-s", "0.05", "--log-format", "json")
-    assert serve_here(monkeypatch, cloud, operator, *arguments) == 1
-    assert calls[0].exception(PATIENCE_S).code() is grpc.StatusCode.UNAVAILABLE
+    with serve_here(monkeypatch, cloud, operator, *arguments) as code:
+        assert code == 1
+        assert calls[0].exception(PATIENCE_S).code() is grpc.StatusCode.UNAVAILABLE
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert any("cut off" in event["message"] for event in events)
 
@@ -196,7 +215,8 @@ def test_a_signal_while_the_model_loads_ends_the_process(
     monkeypatch: pytest.MonkeyPatch, cloud: StubCloud, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cloud.hold()
-    assert serve_here(monkeypatch, cloud, lambda _: cloud.wait_until_running()) == 0
+    with serve_here(monkeypatch, cloud, lambda _: cloud.wait_until_running()) as code:
+        assert code == 0
     stdout, stderr = capsys.readouterr()
     assert "ready" not in stdout
     assert "Traceback" not in stderr
@@ -244,7 +264,8 @@ def test_a_hangup_while_the_model_loads_looks_at_tokens_only(
         eventually(lambda: health_of(robot) == SERVING)
 
     try:
-        serve_here(monkeypatch, cloud, operator)
+        with serve_here(monkeypatch, cloud, operator) as code:
+            assert code == 0
     finally:
         signal.signal(signal.SIGHUP, lived)
     stdout, stderr = capsys.readouterr()
@@ -272,7 +293,7 @@ def test_the_real_command_serves_a_checkpoint_until_ctrl_c(checkpoint: Path) -> 
         request = message(info=cloud.info, instruction="pull the green drawer open")
         with Robot(target) as robot:
             assert len(robot.infer(request).actions) == 8 * 4
-        described = httpx.get(f"{admin}/v1/model").json()
+        described = httpx.get(f"{admin}/v1/model", timeout=PATIENCE_S).json()
         assert described["fingerprint"] == cloud.info.fingerprint
         how = ["dtype=bfloat16", "compact_positions", "fastv=1,0.5"]
         assert described["run_options"] == how

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -31,6 +30,7 @@ from comvla_vla import random_policy
 OK = grpc.StatusCode.OK
 UNAUTHENTICATED = grpc.StatusCode.UNAUTHENTICATED
 PERMISSION_DENIED = grpc.StatusCode.PERMISSION_DENIED
+INVALID_ARGUMENT = grpc.StatusCode.INVALID_ARGUMENT
 RESOURCE_EXHAUSTED = grpc.StatusCode.RESOURCE_EXHAUSTED
 
 ARM_7, ARM_8, SLOW, SMALL = (new_token() for _ in range(4))
@@ -38,12 +38,12 @@ ARM_7, ARM_8, SLOW, SMALL = (new_token() for _ in range(4))
 
 @pytest.fixture
 def tokens(tmp_path: Path) -> Path:
-    """A tokens file."""
+    """A tokens file. Rates are so low that however long a test takes, nothing more may be sent."""
     identities = {
         ARM_7: Identity("arm-7"),
         ARM_8: Identity("arm-8"),
-        SLOW: Identity("slow", Limits(requests_per_s=0.5)),
-        SMALL: Identity("small", Limits(bytes_per_s=50.0, max_request_bytes=400)),
+        SLOW: Identity("slow", Limits(requests_per_s=0.001)),
+        SMALL: Identity("small", Limits(bytes_per_s=0.5, max_request_bytes=400)),
     }
     path = tmp_path / "tokens"
     path.touch(mode=0o600)
@@ -72,10 +72,24 @@ def bearer(token: str) -> tuple[tuple[str, str], ...]:
     return (("authorization", f"Bearer {token}"),)
 
 
+def rewrite(tokens: Path, text: str) -> None:
+    """At one stroke: the server looks at any moment, and must not see half a file."""
+    new = tokens.with_suffix(".new")
+    new.touch(mode=0o600)
+    new.write_text(text)
+    new.replace(tokens)
+
+
 def infer(robot: Robot, token: str | None, *args: Any, **kwargs: Any) -> Any:
     """A call in flight."""
     metadata = None if token is None else bearer(token)
     return robot.stub.Infer.future(message(*args, **kwargs), timeout=PATIENCE_S, metadata=metadata)
+
+
+def waits(server: BackgroundServer, count: int) -> None:
+    """Returns when so many observations wait for the model."""
+    registry = server.server.metrics.registry
+    eventually(lambda: registry.get_sample_value("comvla_queue_depth") == count)
 
 
 def refused_calls(server: BackgroundServer, reason: str) -> float:
@@ -193,33 +207,32 @@ def test_the_session_of_another_robot_is_shut_to_payloads_in_pieces_too(
 
 
 def test_an_observation_that_waits_cannot_be_replaced_by_another_robot(
-    robot: Robot, cloud: StubCloud
+    server: BackgroundServer, robot: Robot, cloud: StubCloud
 ) -> None:
     cloud.hold()
     running = infer(robot, ARM_8, "other")
     cloud.wait_until_running()
     waiting = infer(robot, ARM_7, "mine", 0, name=1.0)
-    eventually(lambda: conflicts(infer(robot, ARM_7, "mine", 0, name=2.0)))  # it has arrived
+    waits(server, 1)
+    assert refusal_of(infer(robot, ARM_7, "mine", 0, name=2.0))[0] is INVALID_ARGUMENT
     assert refusal_of(infer(robot, ARM_8, "mine", 1))[0] is PERMISSION_DENIED
     cloud.release()
     assert waiting.result(PATIENCE_S)
     assert running.result(PATIENCE_S)
 
 
-def conflicts(call: Any) -> bool:
-    """Whether the server knows the step of this call with other content."""
-    error = call.exception(PATIENCE_S)
-    return error is not None and error.code() is grpc.StatusCode.INVALID_ARGUMENT
-
-
-def test_tokens_come_and_go_without_a_restart(robot: Robot, tokens: Path) -> None:
+def test_tokens_come_and_go_without_a_restart(
+    server: BackgroundServer, robot: Robot, tokens: Path
+) -> None:
     assert infer(robot, ARM_7, "a", 0).exception(PATIENCE_S) is None
     fresh = new_token()
-    tokens.write_text(f"{TokenLine.of(Identity('arm-7'), fresh)}\n")
+    rewrite(tokens, f"{TokenLine.of(Identity('arm-7'), fresh)}\n")
     eventually(lambda: infer(robot, ARM_7, "a", 1).code() is UNAUTHENTICATED)
     # The same identity under a new token still owns its session.
     assert infer(robot, fresh, "a", 2).exception(PATIENCE_S) is None
-    tokens.write_text("broken")  # nobody new, nobody out
+    rewrite(tokens, "broken")  # nobody new, nobody out
+    registry, labels = server.server.metrics.registry, {"file": "tokens"}
+    eventually(lambda: registry.get_sample_value("comvla_reload_failures_total", labels))
     assert infer(robot, fresh, "a", 3).exception(PATIENCE_S) is None
 
 
@@ -229,7 +242,7 @@ def test_a_robot_that_asks_too_often_is_told_when_to_come_back(
     assert infer(robot, SLOW, step=0).exception(PATIENCE_S) is None
     code, words = refusal_of(infer(robot, SLOW, step=1))
     assert code is RESOURCE_EXHAUSTED
-    assert "'slow' may make 0.5 calls per second" in words
+    assert "'slow' may make 0.001 calls per second" in words
     assert "retry in" in words
     assert infer(robot, ARM_7, "other").exception(PATIENCE_S) is None
     assert refused_calls(server, "rate") == 1
@@ -240,11 +253,11 @@ def test_a_robot_that_sends_too_much_is_refused(server: BackgroundServer, robot:
     assert code is RESOURCE_EXHAUSTED
     assert "a request of at most 400 bytes from 'small'" in words
     size = message(k=3).ByteSize()
-    assert 100 < size < 400, "more than its two seconds of burst"
+    assert 1 < size < 400, "more than its two seconds of burst"
     assert infer(robot, SMALL, step=0).exception(PATIENCE_S) is None
     code, words = refusal_of(infer(robot, SMALL, step=1))
     assert code is RESOURCE_EXHAUSTED
-    assert "'small' may send 50 bytes per second" in words
+    assert "'small' may send 0.5 bytes per second" in words
     assert refused_calls(server, "oversize") == 1
 
 
@@ -253,24 +266,18 @@ def test_one_robot_cannot_open_all_the_calls(cloud: StubCloud, tokens: Path) -> 
     with BackgroundServer(Engine(cloud), settings) as server, Robot(server.target) as robot:
         cloud.forget()
         cloud.hold()
-        calls = [infer(robot, ARM_7, f"s{i}") for i in range(2)]
-        cloud.wait_until_running()
-        eventually(lambda: refused_of(infer(robot, ARM_7, "s3")) is RESOURCE_EXHAUSTED)
+        calls = [infer(robot, ARM_7, "s0")]
+        cloud.wait_until_running()  # else both may share a pass
+        calls.append(infer(robot, ARM_7, "s1"))
+        waits(server, 1)
+        code, words = refusal_of(infer(robot, ARM_7, "s3"))
+        assert code is RESOURCE_EXHAUSTED
+        assert "'arm-7' has 2 calls open" in words
         other = infer(robot, ARM_8, "other")
         cloud.release()
         assert all(call.exception(PATIENCE_S) is None for call in (*calls, other))
-        # Calls that have ended are no longer counted.
-        assert infer(robot, ARM_7, "s4").exception(PATIENCE_S) is None
-
-
-def refused_of(call: Any) -> grpc.StatusCode | None:
-    """Status of a call that may take long, None while it runs."""
-    done = threading.Event()
-    call.add_done_callback(lambda _: done.set())
-    if not done.wait(0.2):
-        call.cancel()
-        return None
-    return call.code()
+        # Calls that have ended are no longer counted, a moment after their answers have left.
+        eventually(lambda: infer(robot, ARM_7, "s4").exception(PATIENCE_S) is None)
 
 
 def test_strangers_who_watch_the_health_cannot_keep_robots_out(
@@ -301,7 +308,7 @@ def test_bytes_that_are_no_message_are_still_told_apart(robot: Robot) -> None:
         b"\xff\xff\xff", timeout=PATIENCE_S, metadata=bearer(ARM_7)
     )
     code, words = refusal_of(call)
-    assert code is grpc.StatusCode.INVALID_ARGUMENT
+    assert code is INVALID_ARGUMENT
     assert "do not parse" in words
 
 
@@ -309,12 +316,12 @@ def test_a_call_without_a_request_is_refused(robot: Robot) -> None:
     call = robot.channel.stream_unary(f"/{SERVICE_NAME}/Infer").future(
         iter(()), timeout=PATIENCE_S, metadata=bearer(ARM_7)
     )
-    assert refusal_of(call)[0] is grpc.StatusCode.INVALID_ARGUMENT
+    assert refusal_of(call)[0] is INVALID_ARGUMENT
 
 
 def test_sessions_are_listed_with_their_owner(server: BackgroundServer, robot: Robot) -> None:
     infer(robot, ARM_7, "mine").result(PATIENCE_S)
-    (listed,) = httpx.get(f"{server.admin_url}/v1/sessions").json()["sessions"]
+    (listed,) = httpx.get(f"{server.admin_url}/v1/sessions", timeout=PATIENCE_S).json()["sessions"]
     assert (listed["session_id"], listed["identity"]) == ("mine", "arm-7")
 
 
@@ -365,10 +372,10 @@ def test_a_robot_whose_token_is_revoked_holds_and_recovers(tokens: Path) -> None
     ):
         assert robot.step(obs, words).source == "cloud"
         kept = tokens.read_text()
-        tokens.write_text(f"{TokenLine.of(Identity('arm-8'), ARM_8)}\n")
+        rewrite(tokens, f"{TokenLine.of(Identity('arm-8'), ARM_8)}\n")
         held = eventually(lambda: (chunk := robot.step(obs, words)).source != "cloud" and chunk)
         assert held.report.fallback_reason == "unauthorized"
-        tokens.write_text(kept)
+        rewrite(tokens, kept)
         eventually(lambda: robot.step(obs, words).source == "cloud")
 
 

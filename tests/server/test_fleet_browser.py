@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from chromium import Visit, chromium, needs_chromium
-from server_stubs import Robot, StubCloud, message
+from server_stubs import Robot, StubCloud, message, quiet_port
 
 from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
@@ -205,16 +205,16 @@ def test_it_fits_a_phone(
 def test_an_open_page_heals_when_the_server_is_back(
     visit: Callable[..., Visit], cloud: StubCloud
 ) -> None:
-    with BackgroundServer(Engine(cloud)) as first, Robot(first.target) as robot:
+    settings = ServerSettings(admin_port=quiet_port())
+    with BackgroundServer(Engine(cloud), settings) as first, Robot(first.target) as robot:
         robot.infer(message("before.0"))
         page = visit(first.admin_url, allow=("ERR_CONNECTION", "ERR_INCOMPLETE", "ERR_EMPTY"))
         page.wait("document.querySelectorAll('#rows tr').length === 1")
-        port = first.server.admin_port
     page.wait("document.getElementById('state-word').textContent === 'connection lost'")
     assert "Connection lost, retrying" in page.text("#banner")
     assert page.page.locator("#live").get_attribute("class") == "stale"
     assert page.text("#rows .pick").startswith("before")  # what was known stays, marked as old
-    with BackgroundServer(Engine(StubCloud()), ServerSettings(admin_port=port)) as second:
+    with BackgroundServer(Engine(StubCloud()), settings) as second:
         page.wait("document.getElementById('state-word').textContent === 'serving'")
         page.wait("document.querySelectorAll('#rows tr').length === 0")
         assert not page.page.locator("#banner").is_visible()

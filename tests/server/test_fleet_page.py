@@ -6,6 +6,8 @@ import contextlib
 import json
 import re
 import socket
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -180,6 +182,15 @@ def test_a_watcher_that_does_not_read_is_dropped_and_holds_nobody_up(
     monkeypatch.setattr(
         fleet_feed, "_encode", lambda event, data: b"data: " + b"x" * 2**20 + b"\n\n"
     )
+    joined = threading.Event()
+    join = fleet_feed.FleetFeed.join
+
+    def noted(feed: fleet_feed.FleetFeed) -> fleet_feed.Watcher:
+        watcher = join(feed)
+        joined.set()
+        return watcher
+
+    monkeypatch.setattr(fleet_feed.FleetFeed, "join", noted)
     settings = ServerSettings(request_timeout_s=0.5)
     with (
         BackgroundServer(Engine(cloud), settings) as server,
@@ -189,7 +200,7 @@ def test_a_watcher_that_does_not_read_is_dropped_and_holds_nobody_up(
         deaf.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
         feed = server.server._feed
         assert feed is not None
-        eventually(lambda: feed.watchers == 1)
+        assert joined.wait(PATIENCE_S)
         for step in range(40):
             assert robot.infer(message("arm.0", step))
         eventually(lambda: feed.watchers == 0)
@@ -221,7 +232,7 @@ async def test_a_page_that_is_opened_while_the_model_loads_says_so(cloud: StubCl
     await server.bind()
     try:
         async with (
-            httpx.AsyncClient(base_url=server.admin_url) as http,
+            httpx.AsyncClient(base_url=server.admin_url, timeout=PATIENCE_S) as http,
             http.stream("GET", "/events") as answer,
         ):
             lines = [line async for line in _first(answer.aiter_lines(), 2)]
@@ -275,5 +286,7 @@ class TestBehindTokens:
         with watching(http, authorization=f"Bearer {token}") as events:
             next(events)
             tokens_file.write_text(f"{TokenLine.of(Identity('new'), new_token())}\n")
-            assert list(events) is not None  # it ends
+            deadline_s = time.monotonic() + PATIENCE_S
+            for _ in events:  # a heartbeat each second, until it ends
+                assert time.monotonic() < deadline_s, "it never ended"
         assert http.get("/events", headers={"authorization": f"Bearer {token}"}).status_code == 401

@@ -97,10 +97,11 @@ def test_ten_thousand_mutated_requests_do_no_harm(server: BackgroundServer, robo
     assert all(text and text.isprintable() and len(text) <= 1000 for text in messages)
 
     assert len(robot.infer(message("afterwards")).actions) == 6
-    assert httpx.get(f"{server.admin_url}/healthz").status_code == 200
-    metrics = httpx.get(f"{server.admin_url}/metrics").text
+    assert httpx.get(f"{server.admin_url}/healthz", timeout=PATIENCE_S).status_code == 200
+    metrics = httpx.get(f"{server.admin_url}/metrics", timeout=PATIENCE_S).text
     assert "comvla_model_errors_total 0.0" in metrics
-    assert len(httpx.get(f"{server.admin_url}/v1/sessions").json()["sessions"]) > 0
+    sessions = httpx.get(f"{server.admin_url}/v1/sessions", timeout=PATIENCE_S).json()["sessions"]
+    assert len(sessions) > 0
 
 
 def test_random_bytes_to_the_ports_do_no_harm(server: BackgroundServer, robot: Robot) -> None:
@@ -111,7 +112,7 @@ def test_random_bytes_to_the_ports_do_no_harm(server: BackgroundServer, robot: R
             with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as connection:
                 connection.sendall(rng.randbytes(rng.randrange(1, 400)))
     assert robot.infer(message())
-    assert httpx.get(f"{server.admin_url}/readyz").status_code == 200
+    assert httpx.get(f"{server.admin_url}/readyz", timeout=PATIENCE_S).status_code == 200
 
 
 def test_mutated_requests_do_not_break_a_real_model() -> None:

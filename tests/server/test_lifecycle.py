@@ -14,7 +14,7 @@ import pytest
 import pytest_asyncio
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
-from server_stubs import PATIENCE_S, Robot, StubCloud, eventually, message, refusal_of
+from server_stubs import PATIENCE_S, Robot, StubCloud, eventually, message, quiet_port, refusal_of
 
 from comvla.errors import CheckpointError
 from comvla.v1 import policy_pb2, policy_pb2_grpc
@@ -118,12 +118,12 @@ def test_a_stop_lets_calls_in_flight_finish_and_refuses_new_ones(
     eventually(lambda: registry.get_sample_value("comvla_queue_depth") == 1)
 
     stopped: list[bool] = []
-    stopper = threading.Thread(target=lambda: stopped.append(server.stop()))
+    stopper = threading.Thread(target=lambda: stopped.append(server.stop(grace_s=PATIENCE_S)))
     stopper.start()
     health = health_pb2_grpc.HealthStub(robot.channel)
     request = health_pb2.HealthCheckRequest(service=SERVICE_NAME)
     eventually(lambda: health.Check(request).status == NOT_SERVING)
-    assert httpx.get(f"{server.admin_url}/readyz").json()["phase"] == "draining"
+    assert httpx.get(f"{server.admin_url}/readyz", timeout=PATIENCE_S).json()["phase"] == "draining"
     code, words = robot.refused(message("new"))
     assert code is grpc.StatusCode.UNAVAILABLE
     assert "draining and takes no new calls" in words
@@ -157,11 +157,11 @@ def test_stopping_twice_or_before_the_start_is_harmless(cloud: StubCloud) -> Non
 
 
 def test_a_server_can_come_back_on_its_port(cloud: StubCloud) -> None:
-    with BackgroundServer(Engine(cloud)) as first, Robot(first.target) as robot:
+    settings = ServerSettings(port=quiet_port())
+    with BackgroundServer(Engine(cloud), settings) as first, Robot(first.target) as robot:
         robot.infer(message())
-        port = first.server.port
-    with BackgroundServer(Engine(cloud), ServerSettings(port=port)) as second:
-        assert second.server.port == port
+    with BackgroundServer(Engine(cloud), settings) as second:
+        assert second.server.port == first.server.port == settings.port
         with Robot(second.target) as robot:
             assert robot.infer(message())
 

@@ -37,6 +37,8 @@ LATE = grpc.StatusCode.DEADLINE_EXCEEDED
 DOCUMENTED = {grpc.StatusCode.OK, *STATUS.values()} - {grpc.StatusCode.INTERNAL}
 K = 6
 SOON_S, LONG_S = 0.05, MAX_WINDOW_S
+# In which what was sent arrives, also on a busy machine.
+AMPLE_S = 2.0
 
 
 class Uplink:
@@ -107,7 +109,7 @@ def refused(robot: Robot, uplink: Uplink) -> tuple[grpc.StatusCode, str]:
 def counted(server: BackgroundServer, name: str) -> float:
     found = re.search(
         rf"^comvla_{re.escape(name)} (\S+)$",
-        httpx.get(f"{server.admin_url}/metrics").text,
+        httpx.get(f"{server.admin_url}/metrics", timeout=PATIENCE_S).text,
         re.MULTILINE,
     )
     assert found, name
@@ -125,8 +127,7 @@ def test_the_prefix_that_arrived_is_answered_as_infer_answers_it(
     for tokens in range(1, K + 1):
         request = message(f"cut-{tokens}", k=K, quantization=quantization)
         sent = pieces(request.payload, token_ends(K, quantization)[:tokens])
-        uplink = Uplink([opening(request, window_s=SOON_S), *sent], close=False)
-        came = answered(robot, uplink)
+        came = answered(robot, Uplink([opening(request), *sent]))
         expected = robot.infer(
             cut_after(
                 message(f"whole-{tokens}", k=K, quantization=quantization), tokens, quantization
@@ -140,9 +141,7 @@ def test_the_prefix_that_arrived_is_answered_as_infer_answers_it(
 def test_a_piece_that_ends_inside_a_token_counts_up_to_the_token_before(robot: Robot) -> None:
     request = message(k=K)
     cut = token_ends(K)[2] + 5
-    uplink = Uplink(
-        [opening(request, window_s=SOON_S), *pieces(request.payload, [cut])], close=False
-    )
+    uplink = Uplink([opening(request), *pieces(request.payload, [cut])])
     assert answered(robot, uplink).tokens_used == 3
 
 
@@ -188,7 +187,9 @@ def test_a_repeat_is_answered_from_the_record_whatever_arrived_of_it(
     assert counted(server, 'progressive_streams_total{ending="repeat"}') == 3.0
 
 
-def test_two_streams_of_one_step_share_one_answer(robot: Robot, cloud: StubCloud) -> None:
+def test_two_streams_of_one_step_share_one_answer(
+    robot: Robot, server: BackgroundServer, cloud: StubCloud
+) -> None:
     request = message(k=K)
     cloud.hold()
     uplinks = [
@@ -197,6 +198,7 @@ def test_two_streams_of_one_step_share_one_answer(robot: Robot, cloud: StubCloud
     running = call(robot, uplinks[0])
     cloud.wait_until_running()
     repeat = call(robot, uplinks[1])
+    assert eventually(lambda: counted(server, 'progressive_streams_total{ending="repeat"}') == 1.0)
     cloud.release()
     assert running.result(PATIENCE_S).response.tokens_used == 2
     assert repeat.result(PATIENCE_S).response.tokens_used == 2
@@ -294,13 +296,20 @@ def test_a_robot_that_hangs_up_costs_no_compute(
     assert cloud.batches == []
 
 
-def test_the_end_of_a_window_is_no_death(robot: Robot, server: BackgroundServer) -> None:
+def test_what_came_within_a_window_is_answered_and_its_end_is_no_death(
+    robot: Robot, server: BackgroundServer
+) -> None:
     assert server.server._access is not None
     lost: list[object] = []
     server.server._access.door.on_lost = lambda *call: lost.append(call)
-    request = message(k=6)
-    sent = [opening(request, window_s=SOON_S), *pieces(request.payload, token_ends(6)[:3])]
-    assert answered(robot, Uplink(sent, close=False)).tokens_used == 3
+    request = message(k=K)
+    cut = token_ends(K)[2] + 5
+    sent = [opening(request, window_s=AMPLE_S), *pieces(request.payload, [20, cut])]
+    came = answered(robot, Uplink(sent, close=False))
+    assert came.tokens_used == 3
+    expected = robot.infer(cut_after(message("whole", k=K), 3, "float32"))
+    assert list(came.actions) == list(expected.actions)
+    assert counted(server, 'progressive_streams_total{ending="window"}') == 1.0
     assert lost == []
 
 
@@ -394,7 +403,8 @@ def test_mutated_streams_do_no_harm(robot: Robot, server: BackgroundServer) -> N
             if error is not None:
                 assert error.details().isprintable()
     assert set(statuses) <= DOCUMENTED, statuses
-    assert statuses[grpc.StatusCode.OK] > 30
+    # So many come whole or close early; how many more end with a short window is the machine's affair.
+    assert statuses[grpc.StatusCode.OK] > 15
     assert statuses[INVALID] > 100
     assert statuses[LATE] > 10
     assert robot.infer(message("afterwards"))

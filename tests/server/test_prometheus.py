@@ -49,5 +49,6 @@ def test_prometheus_answers_with_the_bytes_that_the_client_counted(tmp_path: Pat
             for expression, total in counted.items():
                 # Nothing is sent any more: the next scrape has the final value.
                 assert eventually(lambda e=expression, t=total: value(http, e) == t), expression
-            assert value(http, 'up{job="comvla"}') == 1.0
-            assert value(http, "comvla_server_ready") == 1.0
+            # A scrape that comes too late on a busy machine leaves both out.
+            assert eventually(lambda: value(http, 'up{job="comvla"}') == 1.0)
+            assert eventually(lambda: value(http, "comvla_server_ready") == 1.0)

@@ -6,7 +6,6 @@ import contextlib
 import importlib.util
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -16,7 +15,7 @@ from typing import Any
 
 import grpc
 import pytest
-from server_stubs import PATIENCE_S, Robot
+from server_stubs import PATIENCE_S, Robot, eventually, quiet_port
 
 from comvla.errors import ComVLAError
 from comvla_server import cli
@@ -69,8 +68,7 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     tokens = folder / "tokens"
     tokens.write_text(f"{TokenLine.of(Identity('arm-7'), TOKEN)}\n")
     tokens.chmod(0o600)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = quiet_port()
     command = [sys.executable, "-m", "comvla_server", "ray", "--insecure", "--replicas", "2"]
     command += ["--model", str(folder / "policy"), "--port", str(port), "--threads", "1"]
     command += ["--tokens-file", str(tokens), "--default-deadline-s", "30"]
@@ -87,6 +85,8 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         watchdog.cancel()
         assert f"grpc=127.0.0.1:{port} " in line, f"not ready within {START_WITHIN_S:g} s"
         assert line.endswith("replicas=2\n")
+        # Whatever it says later must not fill the pipe, where it would wait for a reader.
+        threading.Thread(target=process.stdout.read, daemon=True).start()
         yield f"127.0.0.1:{port}"
     finally:
         watchdog.cancel()
@@ -100,6 +100,7 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @needs_ray
 @pytest.mark.slow
+@pytest.mark.timeout(600)  # START_WITHIN_S counts as well
 def test_robots_are_answered_refused_and_carried_over_the_loss_of_a_replica(target: str) -> None:
     import numpy as np
 
@@ -124,8 +125,9 @@ def test_robots_are_answered_refused_and_carried_over_the_loss_of_a_replica(targ
             assert report.source == "cloud", report.detail
         assert check_health(client._transport.access, PATIENCE_S) == "SERVING"  # type: ignore[attr-defined]
     with ComVLAClient(target, sending="progressive", snr=30.0, **options) as client:
-        report = client.step(observation, "push the button").report
-        assert report.source == "cloud", report.detail
+        # The window is a twentieth of a second, and Ray's proxy takes its part: on a busy machine a
+        # step may come too late.
+        eventually(lambda: client.step(observation, "push the button").report.source == "cloud")
     with Robot(target) as robot:
         code, words = robot.refused(policy_pb2.InferRequest())
         assert code is grpc.StatusCode.UNAUTHENTICATED

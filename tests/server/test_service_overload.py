@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -44,26 +45,45 @@ def ask(robot: Robot, session: str, timeout_s: float) -> Any:
     return call
 
 
+def told_in_time(robot: Robot) -> Any:
+    """The first call of many that is turned away before its own deadline, which a busy machine may
+    not keep: each has a little longer than the one before."""
+    numbers = itertools.count()
+
+    def turned_away() -> Any:
+        number = next(numbers)
+        call = ask(robot, f"robot-{number}", timeout_s=0.05 + 0.01 * number)
+        return call if call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED else None
+
+    return eventually(turned_away)
+
+
+def keep_loop_watch(server: BackgroundServer, late_s: float) -> None:
+    """From now on the server's event loop counts as so late, whatever the machine does."""
+    service = server.server._service
+    assert service is not None
+    watch = service.screening.loop_watch
+    watch.look = lambda: None  # type: ignore[method-assign]
+    watch.forget()
+    watch.late_s = late_s
+
+
 def test_what_cannot_be_answered_in_time_is_turned_away_with_a_hint_when_to_retry(
     server: BackgroundServer, robot: Robot, cloud: StubCloud
 ) -> None:
+    # A loop that is late turns calls away unread, in the same words, and counts them elsewhere.
+    keep_loop_watch(server, late_s=0.0)
     cloud.hold()
     running = robot.send(message("busy", name=-1.0))
     cloud.wait_until_running()
-    names = (f"robot-{i}" for i in range(1000))
-
-    def turned_away() -> Any:
-        # A pass that already took longer than the deadline will not end within it.
-        call = ask(robot, next(names), timeout_s=0.05)
-        return call if call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED else None
-
-    call = eventually(turned_away)
+    # A pass that already took longer than the deadline will not end within it.
+    call = told_in_time(robot)
     hints = LoadHints.from_metadata(call.trailing_metadata())
     assert hints.retry_after_s is not None
     assert 0.0 < hints.retry_after_s < 60.0
     assert "are predicted for 3 tokens; retry in" in call.details()
     assert sample(server, "requests_dropped_total", reason="predicted_late") >= 1
-    assert sample(server, "queue_depth") == 0
+    eventually(lambda: sample(server, "queue_depth") == 0)
     cloud.release()
     assert running.result()
     assert {name for batch in cloud.batches for name in batch} == {-1.0}
@@ -93,7 +113,9 @@ class SlowByTokens(StubCloud):
 def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics() -> None:
     cloud, settings = SlowByTokens(), ServerSettings(advise_least_tokens=1, max_batch=2)
     advised = threading.Event()
-    loads: list[float] = []  # looked at while robots ask: it fades as soon as they stop
+    # Looked at while robots ask: both fade as soon as they stop.
+    loads: list[float] = []
+    wishes: list[float] = []
     with BackgroundServer(Engine(cloud), settings) as server:
 
         def keep_asking(name: str) -> None:
@@ -104,7 +126,8 @@ def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics()
                     if call.exception() is None and 0 < call.result().load.suggested_tokens < 16:
                         advised.set()
                     loads.append(sample(server, "offered_load_ratio"))
-                    if advised.is_set() and loads[-1] > 0.8:
+                    wishes.append(sample(server, "suggested_tokens"))
+                    if advised.is_set() and max(loads) > 0.8 and any(0 < w < 16 for w in wishes):
                         return
 
         threads = [threading.Thread(target=keep_asking, args=(f"r{i}",)) for i in range(4)]
@@ -114,7 +137,7 @@ def test_a_crowded_server_advises_fewer_tokens_in_answers_refusals_and_metrics()
             thread.join()
         assert advised.is_set()
         assert max(loads) > 0.8
-        assert 0 < sample(server, "suggested_tokens") < 16
+        assert any(0 < wish < 16 for wish in wishes)
         assert sample(server, "predicted_wait_seconds_count") >= 8
 
 
@@ -124,19 +147,10 @@ def test_where_the_loop_does_not_keep_up_calls_are_turned_away_unread(
     cloud.hold()
     running = robot.send(message("busy"))
     cloud.wait_until_running()
-    service = server.server._service
-    assert service is not None
-    service.screening.loop_watch.look = lambda: None  # type: ignore[method-assign]
-    service.screening.loop_watch.late_s = 1.0
-    names = (f"robot-{i}" for i in range(1000))
-    codes = []
-
-    def unread() -> float:
-        codes.append(ask(robot, next(names), timeout_s=0.05).code())
-        return sample(server, "calls_refused_total", reason="congested")
-
-    assert eventually(unread) == 1
-    assert codes[-1] is grpc.StatusCode.RESOURCE_EXHAUSTED
+    keep_loop_watch(server, late_s=1.0)
+    # Not each is turned away unread: it may become hopeless while it is read.
+    congested = {"reason": "congested"}
+    eventually(lambda: told_in_time(robot) and sample(server, "calls_refused_total", **congested))
     cloud.release()
     assert running.result()
     assert robot.infer(message("later"))  # a model that rests is worth a look

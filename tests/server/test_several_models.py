@@ -97,21 +97,21 @@ def test_metrics_tell_models_apart_and_know_no_other_names(
     robot.infer(place(step=1))
     for number in range(20):
         robot.refused(message(model=f"guess-{number}"))
-    text = httpx.get(f"{server.admin_url}/metrics").text
+    text = httpx.get(f"{server.admin_url}/metrics", timeout=PATIENCE_S).text
     assert 'comvla_model_requests_total{model="pick",outcome="ok"} 1.0' in text
     assert 'comvla_model_requests_total{model="place",outcome="ok"} 2.0' in text
     assert 'comvla_model_queue_depth{model="place"} 0.0' in text
     assert 'comvla_requests_dropped_total{reason="unknown_model"} 20.0' in text
     assert "guess" not in text
     assert 'comvla_model_info{fingerprint="1ace",model="placer"' in text
-    models = httpx.get(f"{server.admin_url}/v1/models").json()["models"]
+    models = httpx.get(f"{server.admin_url}/v1/models", timeout=PATIENCE_S).json()["models"]
     assert [model["model"] for model in models] == ["pick", "place"]
 
 
 def test_a_model_without_a_name_is_called_default_in_metrics() -> None:
     with BackgroundServer(Engine(StubCloud())) as server, Robot(server.target) as robot:
         robot.infer(message())
-        text = httpx.get(f"{server.admin_url}/metrics").text
+        text = httpx.get(f"{server.admin_url}/metrics", timeout=PATIENCE_S).text
         assert 'comvla_model_requests_total{model="default",outcome="ok"} 1.0' in text
         code, words = robot.refused(message(model="pick"))
     assert code is grpc.StatusCode.NOT_FOUND

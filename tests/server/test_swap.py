@@ -118,7 +118,9 @@ def swap(
 
 def served(server: BackgroundServer) -> dict[str, Any]:
     answer = httpx.get(
-        f"{server.admin_url}/v1/models", headers={"Authorization": f"Bearer {PROMETHEUS}"}
+        f"{server.admin_url}/v1/models",
+        headers={"Authorization": f"Bearer {PROMETHEUS}"},
+        timeout=PATIENCE_S,
     )
     found: dict[str, Any] = answer.json()
     return found
@@ -178,7 +180,6 @@ def test_a_call_under_way_is_finished_by_the_old_model(
         assert value_of(late.result(PATIENCE_S)) == 2.0
         report = swapping.result(PATIENCE_S).json()
     assert report["swapped"]
-    assert report["freed"] in (True, False)  # the stub loader itself holds the old cloud half
 
 
 def test_the_old_engine_is_let_go(tokens: Path) -> None:
@@ -223,7 +224,9 @@ def test_robots_with_the_same_edge_half_go_on(server: BackgroundServer) -> None:
     assert described.model_fingerprint == "beef"
     assert list(described.edge_fingerprints) == ["f00d"]
     metrics = httpx.get(
-        f"{server.admin_url}/metrics", headers={"Authorization": f"Bearer {PROMETHEUS}"}
+        f"{server.admin_url}/metrics",
+        headers={"Authorization": f"Bearer {PROMETHEUS}"},
+        timeout=PATIENCE_S,
     ).text
     assert 'comvla_model_info{fingerprint="beef"' in metrics
     assert 'fingerprint="f00d"' not in metrics
@@ -307,7 +310,9 @@ def test_sessions_stay_their_robots_and_go_on(server: BackgroundServer) -> None:
 
 def _sessions(server: BackgroundServer) -> list[dict[str, Any]]:
     answer = httpx.get(
-        f"{server.admin_url}/v1/sessions", headers={"Authorization": f"Bearer {PROMETHEUS}"}
+        f"{server.admin_url}/v1/sessions",
+        headers={"Authorization": f"Bearer {PROMETHEUS}"},
+        timeout=PATIENCE_S,
     )
     found: list[dict[str, Any]] = answer.json()["sessions"]
     return found
@@ -335,12 +340,15 @@ def test_only_operators_may(server: BackgroundServer, loader: StubLoader) -> Non
     assert "--may-swap" in answer.json()["detail"]
     url = f"{server.admin_url}/v1/models/swap"
     # A browser that knows the operator's password must not be led to do it by another page.
-    by_browser = httpx.post(url, json={"source": "again"}, auth=("operator", OPERATOR))
+    by_browser = httpx.post(
+        url, json={"source": "again"}, auth=("operator", OPERATOR), timeout=PATIENCE_S
+    )
     assert by_browser.status_code == 403
     as_text = httpx.post(
         url,
         content='{"source": "again"}',
         headers={"Authorization": f"Bearer {OPERATOR}", "Content-Type": "text/plain"},
+        timeout=PATIENCE_S,
     )
     assert as_text.status_code == 422
     with BackgroundServer(Engine(loader.clouds["first"]), loader=loader) as open_server:
@@ -377,10 +385,12 @@ def test_an_order_is_read_up_to_a_size(server: BackgroundServer) -> None:
 
 def test_an_order_has_to_arrive_in_time(loader: StubLoader, tokens: Path) -> None:
     settings = ServerSettings(admin_tokens_file=tokens, request_timeout_s=0.2)
-    with BackgroundServer(lambda: loader.load("first"), settings, loader=loader) as server:
-        connection = begin_order(server, OPERATOR, 100)
-        with pytest.raises((RemoteDisconnected, ConnectionError)):
-            connection.getresponse()
+    with (
+        BackgroundServer(lambda: loader.load("first"), settings, loader=loader) as server,
+        # The server may be out of patience while the head is still being sent.
+        pytest.raises((RemoteDisconnected, ConnectionError)),
+    ):
+        begin_order(server, OPERATOR, 100).getresponse()
 
 
 @pytest.mark.parametrize(
@@ -391,6 +401,7 @@ def test_an_order_that_makes_no_sense(server: BackgroundServer, order: Any) -> N
         f"{server.admin_url}/v1/models/swap",
         json=order,
         headers={"Authorization": f"Bearer {OPERATOR}"},
+        timeout=PATIENCE_S,
     )
     assert answer.status_code == 422
 
@@ -506,14 +517,18 @@ def test_a_hangup_takes_over_a_checkpoint_that_changed(tmp_path: Path) -> None:
     arguments = ("-m", "comvla_server", "serve", "--model", str(current), *FREE_PORTS)
     with process(*arguments) as running:
         target, admin, _ = ready_line(running)
-        first = httpx.get(f"{admin}/v1/models").json()["models"][0]["fingerprint"]
+
+        def model() -> Any:
+            return httpx.get(f"{admin}/v1/models", timeout=PATIENCE_S).json()["models"][0]
+
+        first = model()["fingerprint"]
         shutil.rmtree(current)
         shutil.copytree(tmp_path / "two", current)
         os.kill(running.pid, signal.SIGHUP)
 
         def replaced() -> bool:
-            model = httpx.get(f"{admin}/v1/models").json()["models"][0]
-            return model["fingerprint"] != first and model["edge_fingerprints"] == [first]
+            serves = model()
+            return serves["fingerprint"] != first and serves["edge_fingerprints"] == [first]
 
         eventually(replaced)
         with Robot(target) as robot:
