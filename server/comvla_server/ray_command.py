@@ -46,10 +46,10 @@ _SERVICERS = [
 _DEFAULTS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # it would call its makers
     # A busy machine takes longer than 5 s to start a process that imports Ray.
-    "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
+    "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "120",
 }
 _OBJECT_STORE_BYTES = 100 * 2**20
-_PROXY_WITHIN_S = 60.0
+_PROXY_WITHIN_S = 120.0
 _LOOK_EVERY_S = 0.1
 _ELSEWHERE = ("tls_certificate", "tls_key", "tls_client_ca", "admin_tokens_file")
 
