@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -136,6 +136,21 @@ class EveryOther:
         return np.arange(0, len(context.tokens), 2, dtype=np.int32)
 
 
+class Attentive:
+    """Looks at everything that the guide promises."""
+
+    uses_language = True
+    sends_all = False
+    seen: ClassVar[list[tuple[str, int, int]]] = []
+
+    def rank(self, context: Any) -> np.ndarray:
+        words = len(context.instruction.split())
+        queries = context.edge.text_queries(context.instruction)
+        assert torch.equal(queries, context.queries)
+        self.seen.append((context.instruction, words, len(context.proprio)))
+        return np.roll(np.arange(len(context.tokens), dtype=np.int32), words)
+
+
 @pytest.fixture(scope="module")
 def policy() -> Iterator[tuple[EdgeModel, CloudModel]]:
     threads = torch.get_num_threads()
@@ -210,6 +225,20 @@ def test_a_class_of_ones_own_is_a_method(
 ) -> None:
     _, sent = run(world, policy, f"{__name__}:EveryOther")
     assert sent.positions(0) == list(range(0, 512, 2))
+
+
+@pytest.mark.simulator
+def test_a_class_of_ones_own_sees_the_other_instruction_as_it_sees_its_own(
+    world: World, policy: tuple[EdgeModel, CloudModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Attentive, "seen", [])
+    method = f"{__name__}:Attentive"
+    row, _ = run(world, policy, method)
+    assert row["selection"]["frames"] == 2
+    assert row["selection"]["overlap"] is not None
+    told, other = Attentive.seen[:2]
+    assert told[0] == row["spoken"] != other[0]
+    assert told[2] == other[2] == policy[0].info.proprio_dim
 
 
 @pytest.mark.simulator
