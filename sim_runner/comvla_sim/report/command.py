@@ -108,7 +108,16 @@ def read_groups(arguments: list[str]) -> dict[str, list[dict[str, Any]]]:
 
 def _name(shared: dict[str, Any]) -> str:
     fingerprint = shared["model_fingerprint"][:8]
-    return f"{shared['model']} {fingerprint} in {shared['world']}, {shared['quantization']}"
+    ways = "".join(f", {option}" for option in shared.get("run_options", ()))
+    return f"{shared['model']} {fingerprint} in {shared['world']}, {shared['quantization']}{ways}"
+
+
+def _links(rows: list[dict[str, Any]]) -> str:
+    ideal = {row["link"] is None for row in rows}
+    if ideal == {True}:
+        return "a link that loses nothing"
+    limited = "the links that the tables name"
+    return limited if ideal == {False} else f"a link that loses nothing, and over {limited}"
 
 
 def section(name: str, rows: list[dict[str, Any]], summary: dict[str, Any]) -> Section:
@@ -125,9 +134,11 @@ def section(name: str, rows: list[dict[str, Any]], summary: dict[str, Any]) -> S
         f"{len(rows)} episodes in {shared['world']} on {len(layouts)} layouts that training never "
         f"saw; evaluation seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}.",
         f"Model {shared['model']}, fingerprint {shared['model_fingerprint']}; tokens sent as "
-        f"{shared['quantization']} over a link that loses nothing.",
+        f"{shared['quantization']} over {_links(rows)}.",
         "Measured with " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
     ]
+    if "run_options" in shared:
+        story.append(f"The server runs the model with {', '.join(shared['run_options'])}.")
     if shared.get("assets") == "stand-in":
         story.append(
             "Drawn with stand-in assets: these success rates must not be compared with published "
