@@ -78,7 +78,7 @@ def _fastv(layers: int) -> CloudOptions:
     return CloudOptions(fastv=FastV(layer=min(FastV().layer, layers - 1)))
 
 
-_IN_CLOUD = (
+IN_CLOUD = (
     Method(
         "fastv",
         "all tokens cross the link, 75 % are dropped inside the backbone",
@@ -89,6 +89,7 @@ _IN_CLOUD = (
         "--fastv 3,0.75",
     ),
 )
+"""What only a cloud half can do."""
 
 
 def methods() -> dict[str, Method]:
@@ -97,7 +98,7 @@ def methods() -> dict[str, Method]:
         name: Method(name, entry.summary, entry.equation, entry.source, entry.make)
         for name, entry in registry.selectors().items()
     }
-    found |= {method.name: method for method in _IN_CLOUD}
+    found |= {method.name: method for method in IN_CLOUD}
     return found | {name: find_method(name) for name in registry.IMAGE_FORMS}
 
 
@@ -108,13 +109,13 @@ def find_method(name: str) -> Method:
     Raises:
         UnknownMethodError: there is none; the message lists those that exist.
     """
-    for method in _IN_CLOUD:
+    for method in IN_CLOUD:
         if method.name == name:
             return method
     try:
         entry = registry.find_entry(name)
     except registry.UnknownMethodError as error:
-        also = ", ".join(method.name for method in _IN_CLOUD)
+        also = ", ".join(method.name for method in IN_CLOUD)
         raise registry.UnknownMethodError(f"{error} (and in evaluations {also})") from error
     return Method(name, entry.summary, entry.equation, entry.source, entry.make)
 
@@ -147,4 +148,4 @@ def shown_k(name: str, k: int | None) -> str:
 
 def table() -> str:
     """All methods as lines of text, for ``--help``."""
-    return "\n".join([registry.table(), *(f"  {m.name:23}  {m.summary}" for m in _IN_CLOUD)])
+    return "\n".join([registry.table(), *(f"  {m.name:23}  {m.summary}" for m in IN_CLOUD)])
