@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,7 +17,8 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.settings import ServerSettings
 from comvla_sim import cli
-from comvla_sim.experiments import command, rollout, runner, worker
+from comvla_sim.experiments import command, methods, rollout, runner, worker
+from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
 from comvla_sim.experiments.runner import Worker
 from comvla_sim.figures.measuring import Study, kept
@@ -307,7 +310,7 @@ def test_rows_of_a_server_that_runs_its_model_another_way_are_kept_apart(
     with BackgroundServer(Engine(pruning), ServerSettings()) as server:
         assert cli.main([*options, "--target", server.target]) == 0
     (pruned,) = tmp_path.glob("runs/eval/*.jsonl")
-    assert pruned.name.endswith("-int8-seed5-fastv=2,0.75.jsonl")
+    assert pruned.name.endswith("-int8-seed5-fastv-2-0.75.jsonl")
     (row,) = read(pruned)
     assert row["settings"]["run_options"] == ["fastv=2,0.75"]
 
@@ -334,6 +337,66 @@ def test_rows_of_a_server_that_runs_its_model_another_way_are_kept_apart(
     text = (tmp_path / "report" / "report.md").read_text()
     assert "int8, fastv=2,0.75\n" in text
     assert "runs the model with fastv=2,0.75." in text
+
+
+OWN = """\
+import numpy as np
+
+
+class Turned:
+    \"\"\"In raster order, from somewhere on.\"\"\"
+
+    uses_language = False
+    sends_all = False
+
+    def rank(self, context):
+        return np.roll(np.arange(len(context.tokens), dtype=np.int32), 0)
+"""
+
+
+def test_an_edited_selector_of_ones_own_is_measured_anew(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    out, source = tmp_path / "results.jsonl", tmp_path / "own_turned.py"
+    method = "own_turned:Turned"
+    options = ("--method", f"full,{method}", "--k", "16", "--instructions", "drawer-open")
+
+    def begin(text: str) -> str:
+        """What a new process says that finds this source."""
+        source.write_text(text)
+        sys.modules.pop("own_turned", None)
+        methods.find_method.cache_clear()
+        importlib.invalidate_caches()
+        assert evaluate(out, *options) == 0
+        return capsys.readouterr().err
+
+    begin(OWN)
+    assert "4 of 4 episodes are there" in begin(OWN)
+    told = begin(OWN.replace(", 0)", ", 100)"))
+    assert "2 of 4 episodes are there" in told
+    assert f"2 episodes of {method} do not count, its source was another one" in told
+    assert "4 of 4 episodes are there" in begin(OWN.replace(", 0)", ", 100)"))
+    rows = read(out)
+    assert [row["method"] for row in rows].count(method) == 4
+    assert len({row["source_sha256"] for row in rows if row["method"] == method}) == 2
+    assert all("source_sha256" not in row for row in rows if row["method"] == "full")
+
+    assert cli.main(["report", str(out), "--out", str(tmp_path / "report")]) == 0
+    assert "2 of 6 episodes are left out" in capsys.readouterr().err
+
+    # Rows of versions that did not look at the source do not count either, but are read.
+    untold = [{k: v for k, v in row.items() if k != "source_sha256"} for row in rows]
+    out.write_text("".join(json.dumps(row) + "\n" for row in untold))
+    assert "2 of 4 episodes are there" in begin(OWN)
+    # A worker, here or on a node of a cluster, that has another source measures nothing.
+    wanted = EpisodeSpec.from_row({**rows[0], "method": method, "source_sha256": "other"})
+    bare = Worker(EvalSettings(model="random"))
+    try:
+        with pytest.raises(EvaluationError, match="another source here"):
+            bare.run(wanted)
+    finally:
+        bare.close()
 
 
 def test_a_server_that_does_not_answer_is_named(

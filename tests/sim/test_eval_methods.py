@@ -77,9 +77,22 @@ def test_only_what_listens_can_be_misled() -> None:
         ("jpeg-101", "quality from 1 to 100"),
         ("jpeg", "name one, such as jpeg-75"),
         ("nowhere:Nothing", "package.module:ClassName"),
+        ("own_broken:Half", r"cannot import the module 'own_broken'.*SyntaxError"),
+        ("own_sulking:Any", r"cannot import the module 'own_sulking'.*RuntimeError: not today"),
+        (
+            "own_demanding:Needy",
+            r"--method own_demanding:Needy: cannot make one.*'friend'.*defaults",
+        ),
     ],
 )
-def test_what_is_no_method_is_refused_with_what_there_is(name: str, words: str) -> None:
+def test_what_is_no_method_is_refused_with_what_there_is(
+    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_broken.py").write_text("class Half(:\n")
+    (tmp_path / "own_sulking.py").write_text("raise RuntimeError('not today')\n")
+    demanding = "class Needy:\n    def __init__(self, friend):\n        pass\n"
+    (tmp_path / "own_demanding.py").write_text(demanding)
     with pytest.raises(EvaluationError, match=words):
         grid(methods=(name,)).check(num_tokens=512, seed=0)
 

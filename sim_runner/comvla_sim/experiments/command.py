@@ -189,5 +189,6 @@ def default_path(settings: EvalSettings, subject: Subject) -> Path:
     name = f"{world}-{model}-{settings.quantization}-seed{settings.seed}"
     options = "-".join(subject.settings.get("run_options", ()))
     if options:
-        name += "-" + re.sub(r"[^A-Za-z0-9.,=_-]", "_", options)[:LONGEST_OPTIONS]
+        # No "=" either: comvla-sim report takes NAME=FILE.
+        name += "-" + re.sub(r"[^A-Za-z0-9._-]", "-", options)[:LONGEST_OPTIONS]
     return Path("runs") / "eval" / f"{name}.jsonl"

@@ -7,8 +7,11 @@ registered there, or named as ``package.module:ClassName``, is a method here.
 from __future__ import annotations
 
 import functools
+import hashlib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from comvla_client import registry
@@ -57,6 +60,19 @@ class Method:
         if registry.selects(made):
             return made
         return made.selector if isinstance(made, TokenUplink) else None
+
+    @functools.cached_property
+    def source_sha256(self) -> str:
+        """Digest of the file that defines a class of one's own, read once; empty for what has a name here.
+
+        What that file imports is not looked at.
+        """
+        module, own, _ = self.name.partition(":")
+        if not own:
+            return ""
+        modules = (sys.modules.get(name) for name in sorted({module, self.make.__module__}))
+        files = [file for m in modules if (file := getattr(m, "__file__", None)) is not None]
+        return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()
 
     @functools.cached_property
     def listens(self) -> bool:

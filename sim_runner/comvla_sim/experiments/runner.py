@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import platform
+import sys
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -171,12 +172,25 @@ def run(
     missing = [spec for spec in specs if spec not in results.rows]
     if not missing:
         return
+    _tell_of_other_sources(missing, results)
     with contextlib.closing(_measured(settings, missing, shared, workers, ray)) as measured:
         for spec, values in measured:
             row: Row = {"format": FORMAT, **spec.to_row(), **values}
             row.update(settings=shared, environment=story)
             results.append(row)
             on_row(row)
+
+
+def _tell_of_other_sources(missing: list[EpisodeSpec], results: ResultsFile) -> None:
+    own = {spec.method: spec.source_sha256 for spec in missing if spec.source_sha256}
+    for method, digest in own.items():
+        others = sum(s.method == method and s.source_sha256 != digest for s in results.rows)
+        if others:
+            print(
+                f"{results.path}: {others} episodes of {method} do not count, its source was another one when they "
+                "were measured: it is measured anew",
+                file=sys.stderr,
+            )
 
 
 def _measured(

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 def read_groups(arguments: list[str]) -> dict[str, list[dict[str, Any]]]:
     """Rows by group: those of one name, or of equal settings but for the seed. An episode that stands in several
-    files of a group counts once, as the first of them has it.
+    files of a group counts once, as the first of them has it; of an own selector's versions the last one counts.
 
     Raises:
         EvaluationError: a file that is none of results, has no rows, or was measured otherwise than
@@ -103,7 +103,20 @@ def read_groups(arguments: list[str]) -> dict[str, list[dict[str, Any]]]:
                 f"{file}: {repeated} of {len(rows)} episodes stand in a file before it and count once",
                 file=sys.stderr,
             )
-    return groups
+    return {group: _of_newest_sources(group, rows) for group, rows in groups.items()}
+
+
+def _of_newest_sources(group: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of a selector that was edited between its episodes those of its last version."""
+    newest = {row["method"]: row.get("source_sha256") for row in rows}
+    found = [row for row in rows if row.get("source_sha256") == newest[row["method"]]]
+    if len(found) < len(rows):
+        print(
+            f"{group}: {len(rows) - len(found)} of {len(rows)} episodes are left out, the source of their selector "
+            "is another one in later rows",
+            file=sys.stderr,
+        )
+    return found
 
 
 def _name(shared: dict[str, Any]) -> str:
