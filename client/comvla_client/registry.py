@@ -7,6 +7,7 @@ is found once :func:`register` was called, or where an installed package declare
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import sys
@@ -245,6 +246,27 @@ def _imported(name: str) -> Callable[..., Any]:
         raise UnknownMethodError(
             f"cannot find {name!r} ({error}): name it as package.module:ClassName, importable from here"
         ) from error
+    except Exception as error:  # whatever a stranger's module does
+        raise UnknownMethodError(
+            f"cannot import the module {module!r} of {name!r} ({_cause(error)}): mend it, then try again"
+        ) from error
     if not callable(made):
         raise UnknownMethodError(f"{name!r} is no class, but {made!r}")
-    return made  # type: ignore[no-any-return]
+
+    @functools.wraps(made, updated=())
+    def make() -> Any:
+        try:
+            return made()
+        except ComVLAError:
+            raise
+        except Exception as error:
+            raise UnknownMethodError(
+                f"cannot make one of {name!r} ({_cause(error)}): expected a class, or a function, that takes no "
+                "arguments; give its arguments defaults, or name a function that calls it"
+            ) from error
+
+    return make
+
+
+def _cause(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +17,13 @@ from comvla_server.background import BackgroundServer
 from comvla_server.engine import Engine
 from comvla_server.settings import ServerSettings
 from comvla_sim import cli
-from comvla_sim.experiments import command, rollout, worker
+from comvla_sim.experiments import command, methods, rollout, runner, worker
+from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.plan import EpisodeSpec, EvalSettings
 from comvla_sim.experiments.runner import Worker
+from comvla_sim.figures.measuring import Study, kept
 from comvla_sim.worlds.tabletop import Tabletop
-from comvla_vla import random_policy
+from comvla_vla import CloudOptions, FastV, random_policy
 
 pytestmark = pytest.mark.simulator
 
@@ -290,3 +296,114 @@ def test_without_a_name_the_file_is_named_after_what_must_not_be_mixed(
     (path,) = tmp_path.glob("runs/eval/*.jsonl")
     fingerprint = random_policy(0)[0].info.fingerprint
     assert path.name == f"tabletop-comvla-mini-{fingerprint[:8]}-int8-seed5.jsonl"
+
+
+def test_rows_of_a_server_that_runs_its_model_another_way_are_kept_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = EvalSettings(model="random", seed=5)
+    fixed = ["eval", "--model", "random", "--episodes", "1", "--workers", "1", "--seed", "5"]
+    options = [*fixed, "--method", "full", "--instructions", "drawer-open"]
+    cloud = random_policy(0)[1]
+    pruning = cloud.with_options(CloudOptions(fastv=FastV(2, 0.75)))
+    with BackgroundServer(Engine(pruning), ServerSettings()) as server:
+        assert cli.main([*options, "--target", server.target]) == 0
+    (pruned,) = tmp_path.glob("runs/eval/*.jsonl")
+    assert pruned.name.endswith("-int8-seed5-fastv-2-0.75.jsonl")
+    (row,) = read(pruned)
+    assert row["settings"]["run_options"] == ["fastv=2,0.75"]
+
+    # Nobody takes them over as rows of the model as it is ...
+    spec, subject = EpisodeSpec.from_row(row), runner.inspect(settings)
+    study = Study(settings, subject, ("drawer-open",), 1, tmp_path / "paper", 1)
+    folder = tmp_path / "runs" / "eval"
+    assert kept("any", replace(study, reuse=(folder,)), [spec]) == {}
+    with BackgroundServer(Engine(cloud), ServerSettings()) as server:
+        # ... nor goes on in their file,
+        plain = [*options, "--target", server.target]
+        assert cli.main([*plain, "--out", str(pruned)]) == 2
+        assert "run_options ['fastv=2,0.75'], this evaluation has None" in capsys.readouterr().err
+        # and a server without options continues what was measured without one.
+        assert cli.main(options) == 0
+        capsys.readouterr()
+        assert cli.main(plain) == 0
+        assert "1 of 1 episodes are there" in capsys.readouterr().err
+    (same,) = set(tmp_path.glob("runs/eval/*.jsonl")) - {pruned}
+    assert "run_options" not in read(same)[0]["settings"]
+    assert list(kept("any", replace(study, reuse=(folder,)), [spec])) == [spec]
+
+    assert cli.main(["report", str(same), str(pruned), "--out", str(tmp_path / "report")]) == 0
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "int8, fastv=2,0.75\n" in text
+    assert "runs the model with fastv=2,0.75." in text
+
+
+OWN = """\
+import numpy as np
+
+
+class Turned:
+    \"\"\"In raster order, from somewhere on.\"\"\"
+
+    uses_language = False
+    sends_all = False
+
+    def rank(self, context):
+        return np.roll(np.arange(len(context.tokens), dtype=np.int32), 0)
+"""
+
+
+def test_an_edited_selector_of_ones_own_is_measured_anew(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    out, source = tmp_path / "results.jsonl", tmp_path / "own_turned.py"
+    method = "own_turned:Turned"
+    options = ("--method", f"full,{method}", "--k", "16", "--instructions", "drawer-open")
+
+    def begin(text: str) -> str:
+        """What a new process says that finds this source."""
+        source.write_text(text)
+        sys.modules.pop("own_turned", None)
+        methods.find_method.cache_clear()
+        importlib.invalidate_caches()
+        assert evaluate(out, *options) == 0
+        return capsys.readouterr().err
+
+    begin(OWN)
+    assert "4 of 4 episodes are there" in begin(OWN)
+    told = begin(OWN.replace(", 0)", ", 100)"))
+    assert "2 of 4 episodes are there" in told
+    assert f"2 episodes of {method} do not count, its source was another one" in told
+    assert "4 of 4 episodes are there" in begin(OWN.replace(", 0)", ", 100)"))
+    rows = read(out)
+    assert [row["method"] for row in rows].count(method) == 4
+    assert len({row["source_sha256"] for row in rows if row["method"] == method}) == 2
+    assert all("source_sha256" not in row for row in rows if row["method"] == "full")
+
+    assert cli.main(["report", str(out), "--out", str(tmp_path / "report")]) == 0
+    assert "2 of 6 episodes are left out" in capsys.readouterr().err
+
+    # Rows of versions that did not look at the source do not count either, but are read.
+    untold = [{k: v for k, v in row.items() if k != "source_sha256"} for row in rows]
+    out.write_text("".join(json.dumps(row) + "\n" for row in untold))
+    assert "2 of 4 episodes are there" in begin(OWN)
+    # A worker, here or on a node of a cluster, that has another source measures nothing.
+    wanted = EpisodeSpec.from_row({**rows[0], "method": method, "source_sha256": "other"})
+    bare = Worker(EvalSettings(model="random"))
+    try:
+        with pytest.raises(EvaluationError, match="another source here"):
+            bare.run(wanted)
+    finally:
+        bare.close()
+
+
+def test_a_server_that_does_not_answer_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rollout, "CONNECT_TIMEOUT_S", 0.5)
+    assert evaluate(tmp_path / "results.jsonl", "--method", "full", "--target", "127.0.0.1:1") == 2
+    error = capsys.readouterr().err
+    assert "--target 127.0.0.1:1: the server does not say how it runs its model" in error
+    assert not list(tmp_path.iterdir())

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -77,9 +77,22 @@ def test_only_what_listens_can_be_misled() -> None:
         ("jpeg-101", "quality from 1 to 100"),
         ("jpeg", "name one, such as jpeg-75"),
         ("nowhere:Nothing", "package.module:ClassName"),
+        ("own_broken:Half", r"cannot import the module 'own_broken'.*SyntaxError"),
+        ("own_sulking:Any", r"cannot import the module 'own_sulking'.*RuntimeError: not today"),
+        (
+            "own_demanding:Needy",
+            r"--method own_demanding:Needy: cannot make one.*'friend'.*defaults",
+        ),
     ],
 )
-def test_what_is_no_method_is_refused_with_what_there_is(name: str, words: str) -> None:
+def test_what_is_no_method_is_refused_with_what_there_is(
+    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_broken.py").write_text("class Half(:\n")
+    (tmp_path / "own_sulking.py").write_text("raise RuntimeError('not today')\n")
+    demanding = "class Needy:\n    def __init__(self, friend):\n        pass\n"
+    (tmp_path / "own_demanding.py").write_text(demanding)
     with pytest.raises(EvaluationError, match=words):
         grid(methods=(name,)).check(num_tokens=512, seed=0)
 
@@ -134,6 +147,21 @@ class EveryOther:
 
     def rank(self, context: Any) -> np.ndarray:
         return np.arange(0, len(context.tokens), 2, dtype=np.int32)
+
+
+class Attentive:
+    """Looks at everything that the guide promises."""
+
+    uses_language = True
+    sends_all = False
+    seen: ClassVar[list[tuple[str, int, int]]] = []
+
+    def rank(self, context: Any) -> np.ndarray:
+        words = len(context.instruction.split())
+        queries = context.edge.text_queries(context.instruction)
+        assert torch.equal(queries, context.queries)
+        self.seen.append((context.instruction, words, len(context.proprio)))
+        return np.roll(np.arange(len(context.tokens), dtype=np.int32), words)
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +238,20 @@ def test_a_class_of_ones_own_is_a_method(
 ) -> None:
     _, sent = run(world, policy, f"{__name__}:EveryOther")
     assert sent.positions(0) == list(range(0, 512, 2))
+
+
+@pytest.mark.simulator
+def test_a_class_of_ones_own_sees_the_other_instruction_as_it_sees_its_own(
+    world: World, policy: tuple[EdgeModel, CloudModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Attentive, "seen", [])
+    method = f"{__name__}:Attentive"
+    row, _ = run(world, policy, method)
+    assert row["selection"]["frames"] == 2
+    assert row["selection"]["overlap"] is not None
+    told, other = Attentive.seen[:2]
+    assert told[0] == row["spoken"] != other[0]
+    assert told[2] == other[2] == policy[0].info.proprio_dim
 
 
 @pytest.mark.simulator

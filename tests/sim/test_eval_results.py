@@ -58,6 +58,27 @@ def test_two_evaluations_cannot_write_one_file(tmp_path: Path) -> None:
         later.append(made_up_row())
 
 
+def test_what_another_process_appends_before_the_lock_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other one has written a row and let go of the file just when this one asks for the lock."""
+    fcntl = pytest.importorskip("fcntl", reason="a system without file locks")
+    path = tmp_path / "results.jsonl"
+    lines = [json.dumps(made_up_row(episode=episode)) + "\n" for episode in range(2)]
+    path.write_text(lines[0])
+    flock = fcntl.flock
+
+    def late(file: Any, operation: int) -> None:
+        with path.open("a") as other:
+            other.write(lines[1])
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with ResultsFile(path, SETTINGS) as found:
+        assert [row["episode"] for row in found] == [0, 1]
+    assert path.read_text() == "".join(lines)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -65,6 +86,8 @@ def test_two_evaluations_cannot_write_one_file(tmp_path: Path) -> None:
         (b'{"format": 1}\n', "line 1"),
         (b"[1, 2]\n", "line 1"),
         (b"\xff\xfe\n", "line 1"),
+        (b"a shopping list", "ends in a line that is no result.*name another file"),
+        (json.dumps(made_up_row()).encode() + b"\nby hand", "ends in a line that is no result"),
         (json.dumps({**made_up_row(), "format": 99}).encode() + b"\n", "format 99.*1 and 2"),
     ],
 )
@@ -120,7 +143,7 @@ def test_a_link_of_a_later_version_is_refused_and_of_an_earlier_one_has_defaults
 def test_a_folder_or_a_missing_file_is_no_results_file(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="cannot read"):
         read_rows(tmp_path / "missing.jsonl")
-    with pytest.raises(EvaluationError, match="cannot read"):
+    with pytest.raises(EvaluationError, match="cannot write"):
         ResultsFile(tmp_path, SETTINGS)
     blocked = tmp_path / "file"
     blocked.write_text("")

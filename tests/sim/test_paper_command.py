@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from comvla_client import ComVLAClient
 from comvla_sim import cli
+from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.layouts import evaluation_layout
 from comvla_sim.experiments.plan import EvalSettings
 from comvla_sim.experiments.worker import Worker
@@ -25,6 +28,7 @@ from comvla_sim.paper import (
 )
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.kept_tokens import dimmed
+from comvla_sim.paper.results import write
 from comvla_sim.worlds.tabletop import Tabletop
 
 pytestmark = pytest.mark.simulator
@@ -131,6 +135,80 @@ def test_where_nothing_may_be_measured_a_part_that_is_not_there_is_left_out(
     assert printed["latency"] == printed["pictures"] == {"kept": True}
 
 
+@pytest.mark.parametrize("content", ['{"rows": [', "[]", "\x00"])
+def test_a_damaged_part_is_named(
+    content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "latency.json").write_text(content)
+    assert paper(tmp_path, "table2", "--measured-only") == 2
+    message = capsys.readouterr().err
+    assert f"{tmp_path / 'latency.json'} cannot be read or is damaged" in message
+    assert "without --measured-only" in message
+
+
+@pytest.mark.parametrize("part", ["fig4", "fig5"])
+def test_a_damaged_figure_is_no_empty_one(
+    part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / f"{gathering.SWEEP_OF[part]}.jsonl"
+    file.write_text("not a row\n")
+    assert paper(tmp_path, part, "--measured-only") == 2
+    assert f"{file}, line 1 is no result" in capsys.readouterr().err
+
+
+def test_a_file_is_there_whole_or_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "deep" / "latency.json"
+    write(path, b"before")
+
+    def full(self: Path, content: bytes) -> int:
+        with self.open("wb") as file:
+            file.write(content[:3])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(EvaluationError, match=r"cannot write .*latency.json: No space"):
+        write(path, b"afterwards")
+    assert names(path.parent) == {"latency.json"}
+    assert path.read_bytes() == b"before"
+
+
+@pytest.mark.slow
+def test_a_strangers_file_among_those_to_take_over_is_left_out_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "others"
+    folder.mkdir()
+    (folder / "a.jsonl").write_text("my notes\n")
+    (folder / "b.jsonl").write_text('{"format": 99}\n')
+    options = ("--measured-only", "--reuse", str(folder))
+    assert paper(tmp_path / "out", "table4", *options) == 0
+    told = capsys.readouterr().err
+    assert told.count(f"left out: {folder / 'a.jsonl'}, line 1 is no result") == 1
+    assert told.count(f"left out: {folder / 'b.jsonl'}, line 1 has format 99") == 1
+
+
+def test_methods_take_turns_while_they_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    step = ComVLAClient.step
+
+    def told(self: ComVLAClient, *arguments: Any) -> Any:
+        chunk = step(self, *arguments)
+        asked.append(chunk.report.tokens_used)
+        return chunk
+
+    monkeypatch.setattr(ComVLAClient, "step", told)
+    study = measuring.Plan(model="random").study("tabletop", "int8")
+    measured = [Cell("hard_voting", 16), Cell("random", 4), Cell("full")]
+    found = latency.measure_latency(study, measured, repetitions=2)
+    assert asked == [16, 4, 512] * (latency.WARM_UP + 2)
+    assert [(row["method"], row["k"]) for row in found["rows"]] == [
+        (cell.method, cell.k) for cell in measured
+    ]
+    assert found["repetitions"] == 2
+
+
 def names(folder: Path) -> set[str]:
     return {file.name for file in folder.iterdir()}
 
@@ -204,6 +282,13 @@ def exit_code(arguments: list[str]) -> Any:
         (("table1", "--world", "libero"), "--model PATH"),
         (("fig4", "--world", "libero", "--model", "x"), "comvla-sim figure fading --world"),
         (("table1", "--also", "nobody"), "got 'nobody'"),
+        (("table1", "--also", "jpeg"), "--also jpeg: the link decides its quality"),
+        (
+            ("table1", "--also", "jpeg-900"),
+            "--also jpeg-900: expected a jpeg quality from 1 to 100",
+        ),
+        (("table1", "--reuse", "nowhere/at/all"), "--reuse nowhere/at/all is no folder"),
+        (("table3", "--measured-only", "--reuse", "nowhere"), "--reuse nowhere is no folder"),
         (("table4", "--also", "random"), "--also adds lines to Table I"),
         (("table1", "--episodes", "0"), "--episodes must be at least 1"),
         (

@@ -16,6 +16,7 @@ from eval_stubs import made_up_row
 from rich.console import Console
 
 from comvla_sim import cli
+from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.summary import summarise
 from comvla_sim.report.tables import Table
 from comvla_sim.report.terminal import print_summary
@@ -65,6 +66,23 @@ def test_a_report_has_tables_and_plots_and_loads_nothing(
     for plot in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
         ElementTree.parse(out / plot)
     assert len(list(out.glob("*.svg"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("links", "words"),
+    [
+        ([None], "a link that loses nothing."),
+        ([LinkCase()], "the links that the tables name."),
+        ([None, LinkCase()], "a link that loses nothing, and over the links that the tables name."),
+    ],
+)
+def test_a_report_says_what_the_tokens_crossed(
+    tmp_path: Path, links: list[LinkCase | None], words: str
+) -> None:
+    file = write(tmp_path / "a.jsonl", [made_up_row(link=link) for link in links])
+    assert cli.main(["report", file, "--out", str(tmp_path / "report")]) == 0
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert f"tokens sent as int8 over {words}" in text
 
 
 def test_equal_results_give_equal_plots(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,6 +43,9 @@ examples:
   comvla-sim eval --method hard_voting,random --k 32 --ray head-node:6379
   comvla-sim eval --method hard_voting --channel rician --mean-snr-db 0,10 --enforce none,prefix
 """
+
+LONGEST_OPTIONS = 100
+"""Characters of a server's run options in the name of a file: systems allow 255 in all."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -104,6 +108,7 @@ def run(args: argparse.Namespace) -> int:
             f"--quantization {args.quantization!r} is unknown: choose among "
             f"{', '.join(codec.QUANTIZATIONS)}"
         )
+    _check_server_options(args.method, args.target)
     settings = plan.EvalSettings(
         world=args.world,
         model=args.model,
@@ -122,7 +127,6 @@ def run(args: argparse.Namespace) -> int:
         links=links,
     )
     grid.check(num_tokens=subject.num_tokens, seed=args.seed)
-    _check_server_options(args.method, args.target)
     specs = list(grid.specs(subject.num_tokens))
     path = args.out or default_path(settings, subject)
     with ResultsFile(path, subject.settings) as results:
@@ -162,16 +166,15 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_server_options(methods: Sequence[str], target: str | None) -> None:
+def _check_server_options(names: Sequence[str], target: str | None) -> None:
     """Refuses what a server that runs already would have to be started with."""
-    from comvla_sim.experiments.methods import find_method
+    from comvla_sim.experiments.methods import IN_CLOUD
 
-    for name in methods:
-        option = find_method(name).server_option
-        if option and target is not None:
+    for method in IN_CLOUD:
+        if method.name in names and target is not None:
             raise EvaluationError(
-                f"--method {name} is done by the cloud half, and the server at {target} runs as it was "
-                f"started: leave --target out, or serve with {option} and evaluate --method full there"
+                f"--method {method.name} is done by the cloud half, and the server at {target} runs as it was "
+                f"started: leave --target out, or serve with {method.server_option} and evaluate --method full there"
             )
 
 
@@ -183,5 +186,9 @@ def default_path(settings: EvalSettings, subject: Subject) -> Path:
     """A name that changes with everything that must not be mixed in one file."""
     world = settings.world.replace(":", "-")
     model = f"{subject.settings['model']}-{subject.settings['model_fingerprint'][:8]}"
-    name = f"{world}-{model}-{settings.quantization}-seed{settings.seed}.jsonl"
-    return Path("runs") / "eval" / name
+    name = f"{world}-{model}-{settings.quantization}-seed{settings.seed}"
+    options = "-".join(subject.settings.get("run_options", ()))
+    if options:
+        # No "=" either: comvla-sim report takes NAME=FILE.
+        name += "-" + re.sub(r"[^A-Za-z0-9._-]", "-", options)[:LONGEST_OPTIONS]
+    return Path("runs") / "eval" / f"{name}.jsonl"

@@ -9,3 +9,7 @@ class EvaluationError(ComVLAError, ValueError):
 
 class UnansweredError(EvaluationError):
     """A query that the server left without an answer."""
+
+
+class NothingMeasuredError(EvaluationError):
+    """Nothing may be measured, and no episode is there."""

@@ -7,8 +7,11 @@ registered there, or named as ``package.module:ClassName``, is a method here.
 from __future__ import annotations
 
 import functools
+import hashlib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from comvla_client import registry
@@ -59,6 +62,19 @@ class Method:
         return made.selector if isinstance(made, TokenUplink) else None
 
     @functools.cached_property
+    def source_sha256(self) -> str:
+        """Digest of the file that defines a class of one's own, read once; empty for what has a name here.
+
+        What that file imports is not looked at.
+        """
+        module, own, _ = self.name.partition(":")
+        if not own:
+            return ""
+        modules = (sys.modules.get(name) for name in sorted({module, self.make.__module__}))
+        files = [file for m in modules if (file := getattr(m, "__file__", None)) is not None]
+        return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()
+
+    @functools.cached_property
     def listens(self) -> bool:
         """Whether the instruction decides what is sent."""
         selector = self.selector()
@@ -78,7 +94,7 @@ def _fastv(layers: int) -> CloudOptions:
     return CloudOptions(fastv=FastV(layer=min(FastV().layer, layers - 1)))
 
 
-_IN_CLOUD = (
+IN_CLOUD = (
     Method(
         "fastv",
         "all tokens cross the link, 75 % are dropped inside the backbone",
@@ -89,6 +105,7 @@ _IN_CLOUD = (
         "--fastv 3,0.75",
     ),
 )
+"""What only a cloud half can do."""
 
 
 def methods() -> dict[str, Method]:
@@ -97,7 +114,7 @@ def methods() -> dict[str, Method]:
         name: Method(name, entry.summary, entry.equation, entry.source, entry.make)
         for name, entry in registry.selectors().items()
     }
-    found |= {method.name: method for method in _IN_CLOUD}
+    found |= {method.name: method for method in IN_CLOUD}
     return found | {name: find_method(name) for name in registry.IMAGE_FORMS}
 
 
@@ -108,13 +125,13 @@ def find_method(name: str) -> Method:
     Raises:
         UnknownMethodError: there is none; the message lists those that exist.
     """
-    for method in _IN_CLOUD:
+    for method in IN_CLOUD:
         if method.name == name:
             return method
     try:
         entry = registry.find_entry(name)
     except registry.UnknownMethodError as error:
-        also = ", ".join(method.name for method in _IN_CLOUD)
+        also = ", ".join(method.name for method in IN_CLOUD)
         raise registry.UnknownMethodError(f"{error} (and in evaluations {also})") from error
     return Method(name, entry.summary, entry.equation, entry.source, entry.make)
 
@@ -147,4 +164,4 @@ def shown_k(name: str, k: int | None) -> str:
 
 def table() -> str:
     """All methods as lines of text, for ``--help``."""
-    return "\n".join([registry.table(), *(f"  {m.name:23}  {m.summary}" for m in _IN_CLOUD)])
+    return "\n".join([registry.table(), *(f"  {m.name:23}  {m.summary}" for m in IN_CLOUD)])

@@ -43,6 +43,11 @@ class ObservedEdge:
         self.queries: Any = None
 
     @property
+    def model(self) -> EdgeModel:
+        """The model itself, which remembers nothing and hears what it is told."""
+        return self._edge
+
+    @property
     def info(self) -> ModelInfo:
         """Description of the model."""
         return self._edge.info
@@ -141,6 +146,7 @@ class SelectionStatistics:
         self._frames = 0
         self._distinct = 0
         self._overlap = 0.0
+        self._other_instruction = other_instruction
         self._other_queries: Any = None
         self._listens = selector is not None and selector.uses_language
         # What decides itself how much it keeps would keep another number for other words.
@@ -153,13 +159,20 @@ class SelectionStatistics:
         self._visible_somewhere = 0
         self._hits_somewhere = 0
 
-    def add(self, kept: npt.NDArray[np.int32], world: World | None, task: Task) -> None:
+    def add(
+        self,
+        kept: npt.NDArray[np.int32],
+        world: World | None,
+        task: Task,
+        proprio: npt.NDArray[np.float32] | None = None,
+    ) -> None:
         """Takes one frame into account, before the robot moves on.
 
         Args:
             kept: (K,) positions that were sent.
             world: shows where the object is; None where the picture was of another place.
             task: the one whose object should be kept.
+            proprio: (P,) that was sent with them.
         """
         self._frames += 1
         edge = self._edge
@@ -170,7 +183,14 @@ class SelectionStatistics:
         if self._other_queries is not None:
             rng = np.random.default_rng([self._seed, self._frames])
             context = ScoringContext(
-                edge.tokens, edge.projected, self._other_queries, edge.info.grid, rng
+                edge.tokens,
+                edge.projected,
+                self._other_queries,
+                edge.info.grid,
+                rng,
+                edge=edge.model,
+                instruction=self._other_instruction,
+                proprio=proprio,
             )
             others = self._selector.rank(context)[: len(kept)]
             self._overlap += len(np.intersect1d(kept, others)) / len(kept)

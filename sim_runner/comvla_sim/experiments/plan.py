@@ -22,6 +22,9 @@ CONDITIONS = ("normal", "blind", "wrong_instruction", "wrong_selection")
 FULL = "full"
 """The method that sends all tokens: what the others are compared with."""
 
+_UNTOLD = "untold"
+"""Stands for the source of a method of one's own in rows of versions that did not look at it."""
+
 
 @dataclass(frozen=True)
 class EvalSettings:
@@ -54,6 +57,11 @@ class EpisodeSpec:
         task: name of the world's task.
         episode: number that chooses the layout.
         link: that the episode runs over; None loses nothing and takes no time.
+        source_sha256: of the file of a method of one's own (``package.module:ClassName``), which may change under
+            its name; empty for the others, whose versions stand in the settings.
+
+    Raises:
+        UnknownMethodError: no class of that name.
     """
 
     condition: str
@@ -62,10 +70,18 @@ class EpisodeSpec:
     task: str
     episode: int
     link: LinkCase | None = None
+    source_sha256: str = ""
+
+    def __post_init__(self) -> None:
+        if ":" in self.method and not self.source_sha256:
+            object.__setattr__(self, "source_sha256", find_method(self.method).source_sha256)
 
     def to_row(self) -> dict[str, Any]:
         """Plain JSON values, as they stand in a row of results."""
-        return {**vars(self), "link": None if self.link is None else self.link.to_dict()}
+        row = {**vars(self), "link": None if self.link is None else self.link.to_dict()}
+        if not self.source_sha256:
+            del row["source_sha256"]
+        return row
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> EpisodeSpec:
@@ -74,7 +90,8 @@ class EpisodeSpec:
         Raises:
             KeyError, TypeError: the row says too little.
         """
-        named = {field.name: row[field.name] for field in fields(cls)}
+        own = {"source_sha256": _UNTOLD} if ":" in row["method"] else {"source_sha256": ""}
+        named = {field.name: {**own, **row}[field.name] for field in fields(cls)}
         if named["link"] is not None:
             named["link"] = LinkCase.from_dict(named["link"])
         return cls(**named)
@@ -112,7 +129,7 @@ class Grid:
             EvaluationError: names what is wrong.
         """
         _known("--condition", self.conditions, CONDITIONS)
-        self._check_methods()
+        check_methods(self.methods, ideal=None in self.links)
         if self.episodes < 1:
             raise EvaluationError(f"--episodes must be at least 1, got {self.episodes}")
         for episode in (0, self.episodes - 1):
@@ -130,22 +147,6 @@ class Grid:
                 "hard_voting to --method"
             )
 
-    def _check_methods(self) -> None:
-        if not self.methods:
-            raise EvaluationError("--method is empty: comvla-sim eval --help lists what there is")
-        for name in self.methods:
-            try:
-                form = find_method(name).form()
-            except ComVLAError as error:
-                raise EvaluationError(f"--method {name}: {error}") from error
-            except ValueError as error:
-                raise EvaluationError(f"--method {name}: {error}") from error
-            if getattr(form, "adjustable", False) and None in self.links:
-                raise EvaluationError(
-                    f"--method {name}: the link decides its quality, and an ideal link decides nothing: "
-                    f"name one, such as {name}-75, or a --channel"
-                )
-
     def specs(self, num_tokens: int) -> Iterator[EpisodeSpec]:
         """All episodes, layout by layout, so that whatever is there already can be compared."""
         for episode, task, link in itertools.product(range(self.episodes), self.tasks, self.links):
@@ -154,6 +155,31 @@ class Grid:
                     continue  # what does not listen cannot be misled
                 for k in (num_tokens,) if find_method(method).decides_itself else self.ks:
                     yield EpisodeSpec(condition, method, k, task, episode, link)
+
+
+def check_methods(names: Sequence[str], *, ideal: bool, option: str = "--method") -> None:
+    """Refuses names of methods that cannot be run.
+
+    Args:
+        names: as they were given.
+        ideal: whether some episodes run over a link that loses nothing.
+        option: that gave them.
+
+    Raises:
+        EvaluationError: names what is wrong.
+    """
+    if not names:
+        raise EvaluationError(f"{option} is empty: comvla-sim eval --help lists what there is")
+    for name in names:
+        try:
+            form = find_method(name).form()
+        except (ComVLAError, ValueError) as error:
+            raise EvaluationError(f"{option} {name}: {error}") from error
+        if ideal and getattr(form, "adjustable", False):
+            raise EvaluationError(
+                f"{option} {name}: the link decides its quality, and an ideal link decides nothing: "
+                f"name one, such as {name}-75{', or a --channel' if option == '--method' else ''}"
+            )
 
 
 def _known(option: str, names: Sequence[str], known: Sequence[str]) -> None:

@@ -19,6 +19,9 @@ except ImportError:  # a system without file locks
 FORMAT = 2
 """Format 1 knew the ideal link only; its rows are read as such."""
 
+_START = b'{"format": '
+"""Every row begins so, whatever its format."""
+
 Row = dict[str, Any]
 
 spec_of = EpisodeSpec.from_row
@@ -56,9 +59,12 @@ def read_rows(path: Path) -> tuple[list[Row], int]:
         EvaluationError: unreadable, or not a results file; the message names the line.
     """
     try:
-        content = path.read_bytes()
+        return _parsed(path, path.read_bytes())
     except OSError as error:
         raise EvaluationError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _parsed(path: Path, content: bytes) -> tuple[list[Row], int]:
     rows: list[Row] = []
     seen: set[tuple[str, EpisodeSpec]] = set()
     complete = content.rfind(b"\n") + 1
@@ -77,6 +83,12 @@ def read_rows(path: Path) -> tuple[list[Row], int]:
         if key not in seen:
             seen.add(key)
             rows.append(row)
+    cut_off = content[complete:]
+    if cut_off[: len(_START)] != _START[: len(cut_off)]:
+        raise EvaluationError(
+            f"{path} ends in a line that is no result of comvla-sim eval, not even the beginning of one "
+            f"(expected {_START.decode()}..., got {cut_off[: len(_START)]!r}): name another file"
+        )
     return rows, complete
 
 
@@ -100,29 +112,39 @@ class ResultsFile:
         self.rows: dict[EpisodeSpec, Row] = {}
         self._settings = dict(settings)
         self._file: BinaryIO | None = None
-        complete = 0
-        if path.exists():
-            rows, complete = read_rows(path)
-            for row in rows:
-                self._require_same_settings(row)
-                self.rows[spec_of(row)] = row
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = path.open("ab", buffering=0)
+            file = path.open("a+b", buffering=0)
         except OSError as error:
             raise EvaluationError(f"cannot write {path}: {error.strerror}") from error
+        try:
+            self._take_over(file)
+        except BaseException:
+            file.close()
+            raise
+        self._file = file
+
+    def _take_over(self, file: BinaryIO) -> None:
+        """Locks the file, then reads it: until then another process may append to it."""
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                file.close()
                 raise EvaluationError(
-                    f"{path} is being written by another evaluation: wait for it, or name "
+                    f"{self.path} is being written by another evaluation: wait for it, or name "
                     "another file with --out"
                 ) from error
-        if os.fstat(file.fileno()).st_size > complete:
+        try:
+            file.seek(0)
+            content = file.read()
+        except OSError as error:
+            raise EvaluationError(f"cannot read {self.path}: {error.strerror}") from error
+        rows, complete = _parsed(self.path, content)
+        for row in rows:
+            self._require_same_settings(row)
+            self.rows[spec_of(row)] = row
+        if len(content) > complete:
             file.truncate(complete)  # a line that a crash cut off
-        self._file = file
 
     def _require_same_settings(self, row: Row) -> None:
         found = row["settings"]

@@ -221,7 +221,8 @@ def run_episode(
     steps = 0
     with _client(link or target, observed, form, spec, settings, layout_seed) as client:
         while steps < world.max_episode_steps and not ended:
-            shown = {"images": look(totals.queries), "proprio": world.proprio()}
+            proprio = world.proprio()
+            shown = {"images": look(totals.queries), "proprio": proprio}
             hold, asked = client.hold_action, 0 if link is None else link.period
             chunk = client.step(
                 shown, roles.spoken.instruction, None if link is None else link.reading()
@@ -231,7 +232,7 @@ def run_episode(
             record = None if link is None else link.account(report)
             if report.source == "cloud":
                 kept = report.positions[: report.tokens_used]
-                statistics.add(kept, None if film else world, roles.spoken)
+                statistics.add(kept, None if film else world, roles.spoken, proprio)
             elif link is None or report.fallback_reason not in ("no_link", "deadline"):
                 raise UnansweredError(
                     f"the policy gave no answer ({report.fallback_reason}: {report.detail}): check "

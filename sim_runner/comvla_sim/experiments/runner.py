@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import platform
+import sys
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -40,8 +41,13 @@ class Subject:
 def inspect(settings: EvalSettings) -> Subject:
     """Loads world and model once to learn what is being evaluated.
 
+    A server that runs its model in some way of its own (``--fastv``, another dtype) gives other answers under the
+    same fingerprint, so its ``run_options`` are a part of the settings. Where there are none nothing is written, as
+    in files of versions that did not ask.
+
     Raises:
-        CheckpointError, DependencyError, EvaluationError: they cannot be loaded.
+        CheckpointError, DependencyError, EvaluationError: they cannot be loaded, or the server says nothing.
+        HandshakeError: the target is no address.
     """
     from comvla_sim.worlds import make
 
@@ -64,7 +70,35 @@ def inspect(settings: EvalSettings) -> Subject:
         },
         **labels,
     }
+    if settings.target is not None and (options := server_options(settings.target)):
+        shared["run_options"] = options
     return Subject(shared, info.num_tokens, info.token_dim, tasks)
+
+
+def server_options(target: str) -> list[str]:
+    """How a server runs its model where that changes its answers.
+
+    Args:
+        target: ``host:port``.
+
+    Raises:
+        EvaluationError: it does not answer.
+        HandshakeError: the target is no address.
+    """
+    from comvla import handshake
+    from comvla_client.errors import TransportError
+    from comvla_client.reaching import make_transport
+    from comvla_sim.experiments import rollout
+
+    with contextlib.closing(make_transport(target)) as transport:
+        try:
+            answer = transport.get_model(rollout.CONNECT_TIMEOUT_S)
+        except TransportError as error:
+            raise EvaluationError(
+                f"--target {target}: the server does not say how it runs its model ({error}): check "
+                "that it is up, then run the same command again"
+            ) from error
+    return list(handshake.run_options(answer))
 
 
 def package_versions() -> dict[str, str]:
@@ -138,12 +172,25 @@ def run(
     missing = [spec for spec in specs if spec not in results.rows]
     if not missing:
         return
+    _tell_of_other_sources(missing, results)
     with contextlib.closing(_measured(settings, missing, shared, workers, ray)) as measured:
         for spec, values in measured:
             row: Row = {"format": FORMAT, **spec.to_row(), **values}
             row.update(settings=shared, environment=story)
             results.append(row)
             on_row(row)
+
+
+def _tell_of_other_sources(missing: list[EpisodeSpec], results: ResultsFile) -> None:
+    own = {spec.method: spec.source_sha256 for spec in missing if spec.source_sha256}
+    for method, digest in own.items():
+        others = sum(s.method == method and s.source_sha256 != digest for s in results.rows)
+        if others:
+            print(
+                f"{results.path}: {others} episodes of {method} do not count, its source was another one when they "
+                "were measured: it is measured anew",
+                file=sys.stderr,
+            )
 
 
 def _measured(

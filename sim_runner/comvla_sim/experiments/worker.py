@@ -68,12 +68,19 @@ class Worker:
 
         Raises:
             UnansweredError: it went so each time.
-            EvaluationError, ObservationError, InstructionError, HandshakeError: as ``run_episode``.
+            EvaluationError: a method of one's own has another source here; and as ``run_episode``.
+            ObservationError, InstructionError, HandshakeError: as ``run_episode``.
         """
         from comvla_sim.experiments.rollout import run_episode
 
         heard = () if on_query is None else (on_query,)
-        target = self.target(find_method(spec.method))
+        method = find_method(spec.method)
+        if spec.source_sha256 != method.source_sha256:
+            raise EvaluationError(
+                f"{spec.method} has another source here than where the evaluation began: it was edited meanwhile, or "
+                "this node has another version of it; see that it is the same, then run the same command again"
+            )
+        target = self.target(method)
         # What was told of queries cannot be taken back.
         again = isinstance(target, str) and on_query is None
         for _ in range(MOST_TRIES - 1 if again else 0):

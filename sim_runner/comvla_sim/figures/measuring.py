@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -52,6 +53,11 @@ class Study:
         if self.episodes < 1:
             raise EvaluationError(f"--episodes must be at least 1, got {self.episodes}")
         evaluation_layout(self.settings.seed, self.episodes - 1)
+        for folder in self.reuse:
+            if not folder.is_dir():
+                raise EvaluationError(
+                    f"--reuse {folder} is no folder: name one with results of earlier runs, such as runs/eval"
+                )
 
 
 def specs(
@@ -114,11 +120,16 @@ def kept(
 ) -> dict[EpisodeSpec, Row]:
     """The rows that earlier runs have left behind, in the order in which they are wanted.
 
+    Other files that are no results, or those of a version to come, are left out, and standard error says so.
+
     Args:
         name: of the figure, and of its results file.
         study: what is measured on.
         wanted: episodes.
         own: whether the file of that name is read, too.
+
+    Raises:
+        EvaluationError: the file of that name is none of results.
     """
     path = study.out / f"{name}.jsonl"
     missing, found = set(wanted), {}
@@ -126,9 +137,23 @@ def kept(
         for file in sorted(folder.glob("*.jsonl"), key=lambda file: file != path):
             if (file == path and not own) or not missing:
                 continue
-            for row in read_rows(file)[0]:
+            for row in read_rows(file)[0] if file == path else _rows_of_others(file):
                 spec = EpisodeSpec.from_row(row)
                 if row["settings"] == study.subject.settings and spec in missing:
                     found[spec] = row
                     missing.discard(spec)
     return {spec: found[spec] for spec in wanted if spec in found}
+
+
+def _rows_of_others(file: Path) -> list[Row]:
+    try:
+        return read_rows(file)[0]
+    except EvaluationError as error:
+        _say_once(f"left out: {error}")
+        return []
+
+
+@functools.cache
+def _say_once(text: str) -> None:
+    """Each group of cells asks for the same files again."""
+    print(text, file=sys.stderr)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.errors import EvaluationError, NothingMeasuredError
 from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.figures import sweeps
 from comvla_sim.figures.measuring import Study, kept, measure, specs
@@ -38,13 +38,14 @@ def run_sweep(
 
     Raises:
         KeyboardInterrupt: after Ctrl-C, with everything measured so far in the file.
-        EvaluationError: nothing was measured yet, or a file cannot be written.
+        NothingMeasuredError: nothing was measured yet.
+        EvaluationError: a file cannot be read or written.
     """
     wanted = specs(study, series, links)
     rows = kept(figure, study, wanted) if measured_only else measure(figure, study, wanted)
     found = [point for point in points(rows, series, links) if point.episodes]
     if not found:
-        raise EvaluationError(
+        raise NothingMeasuredError(
             f"no episode of {figure} is there yet: run comvla-sim figure {figure}"
         )
     draw = sweeps.draw_fading if figure == "fading" else sweeps.draw_csi_delay

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from comvla_sim.bench import environment
-from comvla_sim.experiments.errors import EvaluationError
+from comvla_sim.experiments.errors import EvaluationError, NothingMeasuredError
 from comvla_sim.experiments.layouts import evaluation_layout
 from comvla_sim.experiments.link_case import LinkCase
 from comvla_sim.experiments.policy import shown_model
@@ -43,7 +43,9 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
         ComVLAError: something cannot be run.
     """
     began = time.monotonic()
+    plan.check()
     study = plan.study(plan.suites()[0], "int8")
+    study.check()
     data: Json = {"format": FORMAT, "story": {}, "cells": [], "pairs": []}
     tables = tuple(part for part in parts if part in TABLES)
     settings: Json = study.subject.settings
@@ -76,11 +78,24 @@ def _kept_or(plan: Plan, name: str, make: Callable[[], Json]) -> Json:
         if not path.exists():
             print(f"{name}: left out, {path} is not there yet", file=sys.stderr)
             return {}
-        return {name: json.loads(path.read_text(encoding="utf-8"))}
+        return {name: _read(path)}
     print(name, file=sys.stderr)
     made = make()
     write(path, (json.dumps(made, indent=1) + "\n").encode())
     return {name: made}
+
+
+def _read(path: Path) -> Json:
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(kept, dict):
+            raise ValueError(f"expected a JSON object, got {type(kept).__name__}")
+    except (OSError, ValueError) as error:
+        raise EvaluationError(
+            f"{path} cannot be read or is damaged ({error}): run the same command without --measured-only, which "
+            "measures it again, or remove the file to leave that part out"
+        ) from error
+    return kept
 
 
 def _latency(plan: Plan, study: Study) -> Json:
@@ -168,10 +183,8 @@ def _sweep(plan: Plan, study: Study, part: str, *, quick: bool) -> Json:
     print(part, file=sys.stderr)
     try:
         printed, _ = run_sweep(figure, study, series, links, measured_only=plan.measured_only)
-    except EvaluationError:
-        if plan.measured_only:
-            return {"points": [], "comparisons": [], "caption": ""}
-        raise
+    except NothingMeasuredError:
+        return {"points": [], "comparisons": [], "caption": ""}
     return {
         "caption": printed["caption"],
         "points": [_point(point) for point in printed["points"]],

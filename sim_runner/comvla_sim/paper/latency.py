@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from statistics import median
 from typing import Any
@@ -24,7 +25,8 @@ def measure_latency(
     """Median compute time of a query, one thread, both halves in this process.
 
     All methods see the same pictures of an expert's episode. ``edge_ms`` is everything on the robot but the call,
-    ``cloud_ms`` decoding and the forward pass; the network takes no time.
+    ``cloud_ms`` decoding and the forward pass; the network takes no time. Methods take turns, query by query, so that
+    whatever else the machine does meanwhile meets all of them, and is no difference between them.
 
     Args:
         study: world and model.
@@ -40,34 +42,31 @@ def measure_latency(
         task = worker.world.find_task(study.tasks[0])
         film = expert_pictures(worker.world, task.name, 0, worker.edge.info.action_horizon)
         proprio = worker.world.proprio()
-        rows = []
-        for cell in cells:
-            edge_s, cloud_s = [], []
-            with _client(worker, cell) as client:
-                for number in range(WARM_UP + repetitions):
-                    shown = {"images": list(film[number % len(film)]), "proprio": proprio}
+        edge_s: dict[Cell, list[float]] = {cell: [] for cell in cells}
+        cloud_s: dict[Cell, list[float]] = {cell: [] for cell in cells}
+        with contextlib.ExitStack() as open_clients:
+            clients = {cell: open_clients.enter_context(_client(worker, cell)) for cell in cells}
+            for number in range(WARM_UP + repetitions):
+                shown = {"images": list(film[number % len(film)]), "proprio": proprio}
+                for cell, client in clients.items():
                     report = client.step(shown, task.instruction).report
                     if number >= WARM_UP:
-                        edge_s.append(report.timings_s["total"] - report.timings_s["call"])
-                        cloud_s.append(report.server_timings_s["total"])
-            rows.append(
-                {
-                    **vars(cell),
-                    "edge_ms": round(1000 * median(edge_s), 2),
-                    "cloud_ms": round(1000 * median(cloud_s), 2),
-                    "total_ms": round(
-                        1000 * median(a + b for a, b in zip(edge_s, cloud_s, strict=True)), 2
-                    ),
-                }
-            )
+                        edge_s[cell].append(report.timings_s["total"] - report.timings_s["call"])
+                        cloud_s[cell].append(report.server_timings_s["total"])
     finally:
         worker.close()
         torch.set_num_threads(threads)
     return {
-        "rows": rows,
+        "rows": [{**vars(cell), **_medians(edge_s[cell], cloud_s[cell])} for cell in cells],
         "repetitions": repetitions,
         "processor": environment.describe()["cpu"],
     }
+
+
+def _medians(edge_s: Sequence[float], cloud_s: Sequence[float]) -> dict[str, float]:
+    total_s = [edge + cloud for edge, cloud in zip(edge_s, cloud_s, strict=True)]
+    named = {"edge_ms": edge_s, "cloud_ms": cloud_s, "total_ms": total_s}
+    return {name: round(1000 * median(times_s), 2) for name, times_s in named.items()}
 
 
 def _client(worker: Worker, cell: Cell) -> ComVLAClient:

@@ -13,7 +13,7 @@ from comvla_sim.experiments import runner
 from comvla_sim.experiments.command import default_path
 from comvla_sim.experiments.errors import EvaluationError
 from comvla_sim.experiments.methods import find_method
-from comvla_sim.experiments.plan import EvalSettings, chosen_tasks
+from comvla_sim.experiments.plan import EvalSettings, check_methods, chosen_tasks
 from comvla_sim.experiments.results import Row
 from comvla_sim.experiments.statistics import mcnemar, wilson_interval
 from comvla_sim.figures.measuring import Study, kept, measure
@@ -53,6 +53,15 @@ class Plan:
     reuse: tuple[Path, ...] = ()
     measured_only: bool = False
     also: tuple[str, ...] = ()
+
+    def check(self) -> None:
+        """Refuses, before anything is loaded, further methods that could not be measured in the end.
+
+        Raises:
+            EvaluationError: names what is wrong.
+        """
+        if self.also:
+            check_methods(self.also, ideal=True, option="--also")
 
     def more_cells(self) -> tuple[tuple[Cell, ...], ...]:
         """What ``also`` adds to Table I, a group for each method.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -166,13 +167,18 @@ def _pooled(found: list[Json]) -> Json:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Writes a file whole.
+    """Writes a file whole: whoever reads it, also after a crash, sees what was there before or all of this.
 
     Raises:
         EvaluationError: it cannot be written.
     """
+    half = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        try:
+            half.write_bytes(content)
+            half.replace(path)
+        finally:
+            half.unlink(missing_ok=True)
     except OSError as error:
         raise EvaluationError(f"cannot write {path}: {error.strerror}") from error

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 def read_groups(arguments: list[str]) -> dict[str, list[dict[str, Any]]]:
     """Rows by group: those of one name, or of equal settings but for the seed. An episode that stands in several
-    files of a group counts once, as the first of them has it.
+    files of a group counts once, as the first of them has it; of an own selector's versions the last one counts.
 
     Raises:
         EvaluationError: a file that is none of results, has no rows, or was measured otherwise than
@@ -103,12 +103,34 @@ def read_groups(arguments: list[str]) -> dict[str, list[dict[str, Any]]]:
                 f"{file}: {repeated} of {len(rows)} episodes stand in a file before it and count once",
                 file=sys.stderr,
             )
-    return groups
+    return {group: _of_newest_sources(group, rows) for group, rows in groups.items()}
+
+
+def _of_newest_sources(group: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of a selector that was edited between its episodes those of its last version."""
+    newest = {row["method"]: row.get("source_sha256") for row in rows}
+    found = [row for row in rows if row.get("source_sha256") == newest[row["method"]]]
+    if len(found) < len(rows):
+        print(
+            f"{group}: {len(rows) - len(found)} of {len(rows)} episodes are left out, the source of their selector "
+            "is another one in later rows",
+            file=sys.stderr,
+        )
+    return found
 
 
 def _name(shared: dict[str, Any]) -> str:
     fingerprint = shared["model_fingerprint"][:8]
-    return f"{shared['model']} {fingerprint} in {shared['world']}, {shared['quantization']}"
+    ways = "".join(f", {option}" for option in shared.get("run_options", ()))
+    return f"{shared['model']} {fingerprint} in {shared['world']}, {shared['quantization']}{ways}"
+
+
+def _links(rows: list[dict[str, Any]]) -> str:
+    ideal = {row["link"] is None for row in rows}
+    if ideal == {True}:
+        return "a link that loses nothing"
+    limited = "the links that the tables name"
+    return limited if ideal == {False} else f"a link that loses nothing, and over {limited}"
 
 
 def section(name: str, rows: list[dict[str, Any]], summary: dict[str, Any]) -> Section:
@@ -125,9 +147,11 @@ def section(name: str, rows: list[dict[str, Any]], summary: dict[str, Any]) -> S
         f"{len(rows)} episodes in {shared['world']} on {len(layouts)} layouts that training never "
         f"saw; evaluation seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}.",
         f"Model {shared['model']}, fingerprint {shared['model_fingerprint']}; tokens sent as "
-        f"{shared['quantization']} over a link that loses nothing.",
+        f"{shared['quantization']} over {_links(rows)}.",
         "Measured with " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
     ]
+    if "run_options" in shared:
+        story.append(f"The server runs the model with {', '.join(shared['run_options'])}.")
     if shared.get("assets") == "stand-in":
         story.append(
             "Drawn with stand-in assets: these success rates must not be compared with published "
