@@ -259,10 +259,14 @@ def _imported(name: str) -> Callable[..., Any]:
             return made()
         except ComVLAError:
             raise
-        except Exception as error:
+        except TypeError as error:
             raise UnknownMethodError(
                 f"cannot make one of {name!r} ({_cause(error)}): expected a class, or a function, that takes no "
                 "arguments; give its arguments defaults, or name a function that calls it"
+            ) from error
+        except Exception as error:
+            raise UnknownMethodError(
+                f"cannot make one of {name!r} ({_cause(error)}): mend it, then try again"
             ) from error
 
     return make

@@ -79,6 +79,16 @@ def test_what_another_process_appends_before_the_lock_is_read(
     assert path.read_text() == "".join(lines)
 
 
+@pytest.mark.parametrize("tail", [b'{"for', b"\0" * 40, b'{"format": 2, "con\0\0'])
+def test_what_a_crash_left_of_the_last_row_is_cut_off(tmp_path: Path, tail: bytes) -> None:
+    path = tmp_path / "results.jsonl"
+    whole = json.dumps(made_up_row()).encode() + b"\n"
+    path.write_bytes(whole + tail)
+    with ResultsFile(path, SETTINGS) as found:
+        assert list(found) == [made_up_row()]
+    assert path.read_bytes() == whole
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -86,6 +96,7 @@ def test_what_another_process_appends_before_the_lock_is_read(
         (b'{"format": 1}\n', "line 1"),
         (b"[1, 2]\n", "line 1"),
         (b"\xff\xfe\n", "line 1"),
+        (b"\0\0\0", "ends in a line that is no result"),
         (b"a shopping list", "ends in a line that is no result.*name another file"),
         (json.dumps(made_up_row()).encode() + b"\nby hand", "ends in a line that is no result"),
         (json.dumps({**made_up_row(), "format": 99}).encode() + b"\n", "format 99.*1 and 2"),

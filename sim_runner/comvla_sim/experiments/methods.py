@@ -133,7 +133,9 @@ def find_method(name: str) -> Method:
     except registry.UnknownMethodError as error:
         also = ", ".join(method.name for method in IN_CLOUD)
         raise registry.UnknownMethodError(f"{error} (and in evaluations {also})") from error
-    return Method(name, entry.summary, entry.equation, entry.source, entry.make)
+    method = Method(name, entry.summary, entry.equation, entry.source, entry.make)
+    _ = method.source_sha256  # read with the module: the file may be edited while episodes run
+    return method
 
 
 def sends_pictures(name: str) -> bool:

@@ -84,7 +84,8 @@ def _parsed(path: Path, content: bytes) -> tuple[list[Row], int]:
             seen.add(key)
             rows.append(row)
     cut_off = content[complete:]
-    if cut_off[: len(_START)] != _START[: len(cut_off)]:
+    begun = cut_off.rstrip(b"\0")  # a power failure leaves zeros
+    if begun[: len(_START)] != _START[: len(begun)] or (begun != cut_off and not rows):
         raise EvaluationError(
             f"{path} ends in a line that is no result of comvla-sim eval, not even the beginning of one "
             f"(expected {_START.decode()}..., got {cut_off[: len(_START)]!r}): name another file"

@@ -133,7 +133,7 @@ def caption(points: Sequence[Point], study: Study, link: LinkCase) -> str:
     parts = [
         f"{study.subject.settings['model']} in {study.settings.world}, "
         f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} "
-        f"episodes per point ({study.episodes} tables for each of {len(study.tasks)} instructions), "
+        f"episodes per point ({study.episodes} layouts for each of {len(study.tasks)} instructions), "
         f"evaluation seed {study.settings.seed}; Wilson's 95 % intervals.",
         f"Link of {link.bandwidth_hz / 1e6:g} MHz, T = {1000 * link.period_s:g} ms, "
         f"η = {link.efficiency:g}, f_d = {link.doppler_hz:g} Hz, κ = {link.rician_k:g} (Rician); "

@@ -5,7 +5,15 @@ from __future__ import annotations
 from comvla_sim.paper.cells import Cell
 from comvla_sim.paper.published import EPISODES_PER_SUITE, SUITES
 from comvla_sim.paper.results import Results
-from comvla_sim.paper.verdicts import AGREES, UNTESTED, Rate, Verdict, compare_changes, contrast
+from comvla_sim.paper.verdicts import (
+    AGREES,
+    DIFFERS,
+    UNTESTED,
+    Rate,
+    Verdict,
+    compare_changes,
+    contrast,
+)
 
 STAND_IN = Verdict(UNTESTED, "drawn with stand-in assets")
 SOME_SUITES = Verdict(
@@ -73,8 +81,13 @@ def lead_verdict(
         printed: what the paper prints for them, percent.
     """
     verdict, ours = change_verdict(results, cells, printed), results.shared(*cells)
-    if ours is None or verdict.kind != AGREES or contrast([(1, ours[0]), (-1, ours[1])])[1] > 0:
+    if ours is None or verdict.kind != AGREES:
         return verdict
+    _, low, high = contrast([(1, ours[0]), (-1, ours[1])])
+    if low > 0:
+        return verdict
+    if high < 0:
+        return Verdict(DIFFERS, "in that the other is ahead")
     return Verdict(
         UNTESTED, f"{ours[0].episodes} episodes show neither that lead nor that there is none"
     )

@@ -12,6 +12,7 @@ from comvla_sim.bench import environment
 from comvla_sim.experiments.errors import EvaluationError, NothingMeasuredError
 from comvla_sim.experiments.layouts import evaluation_layout
 from comvla_sim.experiments.link_case import LinkCase
+from comvla_sim.experiments.methods import find_method
 from comvla_sim.experiments.policy import shown_model
 from comvla_sim.figures.measuring import Study
 from comvla_sim.paper.cells import GROUPS, PAPER_CELLS, ordered
@@ -54,7 +55,13 @@ def gather(plan: Plan, parts: Sequence[str], *, quick: bool = False) -> Results:
         groups = ordered(tables, also)
         measured, settings = measure_cells(plan, groups)
         there = {cell for _, cell in measured}
-        data["missing"] = [cell.name for group in groups for cell in group if cell not in there]
+        data["missing"] = [
+            cell.name
+            for group in groups
+            for cell in group
+            if cell not in there
+            and (plan.target is None or not find_method(cell.method).server_option)
+        ]
         data["cells"], data["pairs"] = all_counts(measured), all_pairs(measured)
     inside = plan.target is None
     if inside and {"table1", "table2"} & set(tables):

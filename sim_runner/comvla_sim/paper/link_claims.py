@@ -24,11 +24,12 @@ def fading(results: Results) -> Claim | None:
     )
     verdict = ahead(hard, lot)
     votes, others = (_fall(results, name) for name in ("unenforced", "random"))
-    if verdict.kind == AGREES and votes is not None and others is not None:
-        here += (
-            f"; from the best link to the worst votes lose {100 * votes:.0f} points, and random tokens "
-            f"{100 * others:.0f} of the few that they have"
-        )
+    if verdict.kind == AGREES:
+        if votes is not None and others is not None:
+            here += (
+                f"; from the best link to the worst votes lose {100 * votes:.0f} points, and random tokens "
+                f"{100 * others:.0f} of the few that they have"
+            )
         verdict = Verdict(AGREES, "in that it is far ahead; how the two fall cannot be compared")
     return (
         "Under fading it degrades more gracefully than random tokens (Object, Rician, 5 dB: "

@@ -167,11 +167,12 @@ def _pooled(found: list[Json]) -> Json:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Writes a file whole: whoever reads it, also after a crash, sees what was there before or all of this.
+    """Writes a file whole: whoever reads it, also after this process died, sees what was there before or all of this.
 
     Raises:
         EvaluationError: it cannot be written.
     """
+    path = path.resolve()  # what a link leads to is written, not the link
     half = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -113,7 +113,7 @@ def _of_newest_sources(group: str, rows: list[dict[str, Any]]) -> list[dict[str,
     if len(found) < len(rows):
         print(
             f"{group}: {len(rows) - len(found)} of {len(rows)} episodes are left out, the source of their selector "
-            "is another one in later rows",
+            "is another one in the last row",
             file=sys.stderr,
         )
     return found
