@@ -82,16 +82,18 @@ class Worker:
             )
         target = self.target(method)
         # What was told of queries cannot be taken back.
-        again = isinstance(target, str) and on_query is None
-        for _ in range(MOST_TRIES - 1 if again else 0):
+        tries = MOST_TRIES if isinstance(target, str) and on_query is None else 1
+        while True:
             try:
                 return spec, run_episode(
                     self.world, self.edge, target, spec, self._settings, *heard
                 )
             except UnansweredError as error:
+                tries -= 1
+                if not tries:
+                    raise
                 print(f"{error}; the episode starts again", file=sys.stderr, flush=True)
                 time.sleep(PAUSE_S)
-        return spec, run_episode(self.world, self.edge, target, spec, self._settings, *heard)
 
     def target(self, method: Method) -> Transport | str:
         """Where a method's requests go: the user's server, or the cloud half here, run as the method needs."""
